@@ -1,0 +1,243 @@
+"""Train the expert policy of a physics environment with brax PPO; kill it at any time and start it again.
+
+    python experiments/train_expert.py humanoid                 # train, or go on from the last checkpoint
+    python experiments/train_expert.py humanoid --ship           # score the best checkpoints, write the package's weights
+
+Every evaluation appends a row to `curve.csv` and writes a checkpoint (observation statistics, policy and value
+network; the optimizer starts afresh after an interruption). `--ship` scores the checkpoints with the
+highest returns on many fresh episodes and writes the best one to `fleetjax/supervisors/weights/`.
+"""
+
+import argparse
+import csv
+import functools
+import json
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.envs.base import Env as BraxEnv
+from brax.envs.base import State
+from brax.training import types
+from brax.training.acme import running_statistics, specs
+from brax.training.agents.ppo import networks, train
+from flax import linen, serialization
+
+from fleetjax import envs
+from fleetjax.supervisors import expert
+
+PACKAGE_WEIGHTS = Path(expert.__file__).parent / "weights"
+
+# Hyper-parameters of each task; the rest are brax's defaults.
+SETTINGS = {
+    "humanoid": dict(
+        num_envs=1024,
+        unroll_length=16,
+        batch_size=64,
+        num_minibatches=32,
+        num_updates_per_batch=4,
+        learning_rate=3e-4,
+        learning_rate_schedule="ADAPTIVE_KL",
+        learning_rate_schedule_min_lr=1e-4,
+        learning_rate_schedule_max_lr=6e-4,
+        desired_kl=0.02,
+        clipping_epsilon=0.3,
+        entropy_cost=1e-3,
+        discounting=0.97,
+        reward_scaling=0.1,
+        max_grad_norm=1.0,
+    ),
+}
+make_networks = functools.partial(
+    networks.make_ppo_networks,
+    policy_hidden_layer_sizes=(256, 128),
+    value_hidden_layer_sizes=(256, 128),
+    activation=linen.elu,
+)
+
+if not hasattr(jax, "device_put_replicated"):  # brax 0.14.2 calls it; jax 0.10 dropped it (brax issue 671)
+
+    def _replicate(tree, devices):
+        sharding = jax.sharding.NamedSharding(jax.sharding.Mesh(np.array(devices), ("i",)), jax.sharding.PartitionSpec("i"))
+        return jax.device_put(jax.tree.map(lambda x: jnp.stack([x] * len(devices)), tree), sharding)
+
+    jax.device_put_replicated = _replicate
+
+
+class Task(BraxEnv):
+    """A fleetjax environment as brax sees it; brax's own wrappers reset it and cut its episodes."""
+
+    def __init__(self, env: envs.Env):
+        self.env = env
+
+    def reset(self, rng: jax.Array) -> State:
+        """Start an episode."""
+        state = self.env.reset(rng, jnp.int32(0))
+        return State(state, state.obs, state.reward, jnp.float32(0), {}, {"key": rng})
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Take one control step; a violation ends the episode."""
+        key_next, key_step = jax.random.split(state.info["key"])
+        after = self.env.step(state.pipeline_state, action, jnp.bool_(True), key_step)
+        done = after.violation.astype(jnp.float32)
+        info = {**state.info, "key": key_next}
+        return state.replace(pipeline_state=after, obs=after.obs, reward=after.reward, done=done, info=info)
+
+    @property
+    def observation_size(self) -> int:
+        """Length of the observation."""
+        return self.env.spec.observation_size
+
+    @property
+    def action_size(self) -> int:
+        """Length of the action."""
+        return self.env.spec.action_size
+
+    @property
+    def backend(self) -> str:
+        """Name that brax's registry would use."""
+        return "fleetjax"
+
+
+def template(task: Task):
+    """Return parameters of the right structure, to read a checkpoint into."""
+    nets = make_networks(task.observation_size, task.action_size, types.identity_observation_preprocessor)
+    key = jax.random.key(0)
+    statistics = running_statistics.init_state(specs.Array((task.observation_size,), jnp.dtype("float32")))
+    return statistics, nets.policy_network.init(key), nets.value_network.init(key)
+
+
+def checkpoints(folder: Path) -> list[Path]:
+    """Return the checkpoints of a run, oldest first."""
+    return sorted(folder.glob("checkpoint_*.msgpack"))
+
+
+def train_expert(name: str, folder: Path, *, num_timesteps: int, evaluate_every: int, seed: int) -> None:
+    """Train until `num_timesteps` in all, from the last checkpoint if there is one."""
+    folder.mkdir(parents=True, exist_ok=True)
+    task = Task(envs.make_env(name, success_return=float("inf")))
+    done, restore = 0, None
+    if checkpoints(folder):
+        last = checkpoints(folder)[-1]
+        done = int(last.stem.split("_")[1])
+        restore = serialization.from_bytes(template(task), last.read_bytes())
+        print(f"going on from {last} at {done:,} steps")
+    start = time.time()
+
+    def save(step: int, _, params) -> None:
+        if step > 0:
+            temporary = folder / "checkpoint.tmp"
+            temporary.write_bytes(serialization.to_bytes(params))
+            temporary.rename(folder / f"checkpoint_{done + step:010d}.msgpack")
+
+    def log(step: int, metrics) -> None:
+        row = {
+            "steps": done + step,
+            "seconds": round(time.time() - start, 1),
+            "episode_return": round(float(metrics["eval/episode_reward"]), 1),
+            "episode_return_std": round(float(metrics["eval/episode_reward_std"]), 1),
+            "episode_length": round(float(metrics["eval/avg_episode_length"]), 1),
+        }
+        new = not (folder / "curve.csv").exists()
+        with (folder / "curve.csv").open("a", newline="") as file:
+            writer = csv.DictWriter(file, row)
+            if new:
+                writer.writeheader()
+            writer.writerow(row)
+        print(row, {k: float(v) for k, v in metrics.items() if any(word in k for word in ("kl", "learning_rate", "sps"))}, flush=True)
+
+    remaining = num_timesteps - done
+    train.train(
+        environment=task,
+        num_timesteps=remaining,
+        episode_length=task.env.spec.horizon,
+        normalize_observations=True,
+        network_factory=make_networks,
+        num_evals=max(2, 1 + remaining // evaluate_every),
+        deterministic_eval=True,
+        num_eval_envs=128,
+        seed=seed + done,
+        progress_fn=log,
+        policy_params_fn=save,
+        restore_params=restore,
+        **SETTINGS[name],
+    )
+
+
+def as_weights(params) -> dict[str, np.ndarray]:
+    """Turn brax parameters into the arrays that the package ships (see `fleetjax.supervisors.expert`)."""
+    statistics, policy, _ = params
+    weights = {"obs_mean": np.asarray(statistics.mean), "obs_std": np.asarray(statistics.std)}
+    for i, (_, layer) in enumerate(sorted(policy["params"].items())):
+        weights[f"kernel_{i}"], weights[f"bias_{i}"] = np.asarray(layer["kernel"]), np.asarray(layer["bias"])
+    final = max(int(k.split("_")[1]) for k in weights if k.startswith("kernel"))
+    half = weights[f"kernel_{final}"].shape[1] // 2  # mean and scale; the expert acts with the mean
+    weights[f"kernel_{final}"], weights[f"bias_{final}"] = weights[f"kernel_{final}"][:, :half], weights[f"bias_{final}"][:half]
+    return weights
+
+
+def ship(name: str, folder: Path, *, candidates: int, num_episodes: int) -> None:
+    """Score the most promising checkpoints on fresh episodes and write the best into the package.
+
+    Episodes whose return is at least 95 % of the mean over full-length episodes (and the task's floor) succeed;
+    the checkpoint with most successes wins.
+    """
+    with (folder / "curve.csv").open() as file:
+        curve = {int(row["steps"]): float(row["episode_return"]) for row in csv.DictReader(file)}
+    task = Task(envs.make_env(name, success_return=float("inf")))
+    ranked = sorted(checkpoints(folder), key=lambda path: -curve.get(int(path.stem.split("_")[1]), -np.inf))
+    best = None
+    for path in ranked[:candidates]:
+        weights = as_weights(serialization.from_bytes(template(task), path.read_bytes()))
+        returns, lengths = expert.score(task.env, weights, num_episodes=num_episodes, key=jax.random.key(1))
+        full = lengths == task.env.spec.horizon
+        mean = float(returns[full].mean()) if full.any() else float("nan")
+        record = {
+            "environment": name,
+            "steps": int(path.stem.split("_")[1]),
+            "num_episodes": num_episodes,
+            "mean_return": round(float(returns.mean()), 1),
+            "mean_return_full_length": round(mean, 1),
+            "share_full_length": round(float(full.mean()), 4),
+            "share_successful": round(float((full & (returns > max(envs.SUCCESS_FLOOR.get(name, -np.inf), 0.95 * mean))).mean()), 4),
+        }
+        print(record, flush=True)
+        if best is None or record["share_successful"] > best[0]["share_successful"]:
+            best = (record, weights)
+    assert best is not None, f"no checkpoint in {folder}"
+    PACKAGE_WEIGHTS.mkdir(exist_ok=True)
+    np.savez_compressed(PACKAGE_WEIGHTS / f"{name}.npz", **best[1])
+    (PACKAGE_WEIGHTS / f"{name}.json").write_text(json.dumps(best[0], indent=2) + "\n")
+    (PACKAGE_WEIGHTS / f"{name}_curve.csv").write_text((folder / "curve.csv").read_text())
+    print(f"shipped {best[0]}")
+
+
+def main() -> None:
+    """Parse the command line and train or ship."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("environment", choices=sorted(SETTINGS))
+    parser.add_argument("--output", type=Path, help="folder of checkpoints (default: runs/experts/ENVIRONMENT)")
+    parser.add_argument("--num-timesteps", type=int, default=40_000_000, help="environment steps in all")
+    parser.add_argument("--evaluate-every", type=int, default=1_000_000, help="environment steps between evaluations")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--ship", action="store_true", help="choose the best checkpoint and write it into the package")
+    parser.add_argument("--candidates", type=int, default=5, help="checkpoints to score with --ship")
+    parser.add_argument("--num-episodes", type=int, default=512, help="episodes a checkpoint is scored on with --ship")
+    args = parser.parse_args()
+    folder = args.output or Path("runs/experts") / args.environment
+    if args.ship:
+        ship(args.environment, folder, candidates=args.candidates, num_episodes=args.num_episodes)
+    else:
+        train_expert(
+            args.environment,
+            folder,
+            num_timesteps=args.num_timesteps,
+            evaluate_every=args.evaluate_every,
+            seed=args.seed,
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,98 @@
+"""The contract that every environment meets, and the registry of environments."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from fleetjax.types import EnvState
+
+
+class EnvSpec(NamedTuple):
+    """What the fleet must know of an environment before it runs.
+
+    Attributes:
+        name: the registered name, or any name for an unregistered environment.
+        observation_size: O.
+        action_size: A; for discrete actions the number of choices (actions are then one-hot f32[A]).
+        horizon: control steps after which an episode times out.
+        control_step: seconds between two actions.
+        discrete: whether actions are choices rather than vectors in [-1, 1].
+        has_goal: whether `success` means that a goal was reached, so that a goal critic can learn from it.
+        supervisor: registered name of the supervisor that helps by default.
+        defaults: `Config` fields whose default this environment changes.
+    """
+
+    name: str
+    observation_size: int
+    action_size: int
+    horizon: int
+    control_step: float
+    discrete: bool = False
+    has_goal: bool = False
+    supervisor: str = ""
+    defaults: Mapping[str, Any] = {}
+
+
+class Env(NamedTuple):
+    """Pure functions of one robot's task. It never resets itself: that is what fleets compete for.
+
+    Attributes:
+        reset: `(key, robot i32[]) -> EnvState`, a draw from the initial distribution of that robot.
+        step: `(EnvState, action f32[A], active bool[], key) -> EnvState`. What it returns for an inactive robot is
+            ignored; a physics backend may skip the work.
+        spec: static facts.
+        next_goal: `(EnvState, key) -> EnvState` draws a new goal after a success and lets the episode go on;
+            None if a success ends the episode.
+    """
+
+    reset: Callable[[jax.Array, jax.Array], EnvState]
+    step: Callable[[EnvState, jax.Array, jax.Array, jax.Array], EnvState]
+    spec: EnvSpec
+    next_goal: Callable[[EnvState, jax.Array], EnvState] | None = None
+
+
+def begin(physics: Any, obs: jax.Array) -> EnvState:
+    """Return the first state of an episode.
+
+    Args:
+        physics: the environment's inner state.
+        obs: f32[O] its observation.
+    """
+    no, zero = jnp.zeros((), bool), jnp.zeros((), jnp.float32)
+    return EnvState(physics, obs, zero, no, no, no, zero, jnp.zeros((), jnp.int32))
+
+
+def proceed(
+    state: EnvState,
+    *,
+    physics: Any,
+    obs: jax.Array,
+    reward: jax.Array,
+    violation: jax.Array,
+    horizon: int,
+    success: jax.Array | None = None,
+    success_return: float | None = None,
+) -> EnvState:
+    """Return the successor of `state`, with the episode's accounts brought up to date.
+
+    A violation beats success and time-out. Locomotion passes `success_return`: success is then judged on the
+    step that reaches the horizon.
+
+    Args:
+        state: the state that was stepped.
+        physics: the successor's inner state.
+        obs: f32[O] the successor's observation.
+        reward: f32[] reward of the step.
+        violation: bool[] whether the successor violates the constraint.
+        horizon: control steps in an episode.
+        success: bool[] whether the step completed the task.
+        success_return: the undiscounted return above which an episode of full length succeeds.
+    """
+    episode_return = state.episode_return + reward
+    episode_step = state.episode_step + 1
+    timeout = (episode_step >= horizon) & ~violation
+    if success is None:
+        success = timeout & (episode_return > jnp.float32(jnp.inf if success_return is None else success_return))
+    return EnvState(physics, obs, reward, violation, success & ~violation, timeout, episode_return, episode_step)

@@ -1,0 +1,79 @@
+"""Expert policies that ship with the package: small networks trained in this physics.
+
+Each expert is an npz of arrays (observation mean and standard deviation, dense layers with ELU between them and
+tanh behind the last) and a JSON of its measured returns; `experiments/train_expert.py` writes both.
+"""
+
+import functools
+import json
+from importlib import resources
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fleetjax.envs.base import Env
+
+_WEIGHTS = resources.files("fleetjax.supervisors") / "weights"
+
+
+def record(name: str) -> dict:
+    """Return the training record of a shipped expert: steps, mean returns, share of full-length episodes.
+
+    Raises:
+        FileNotFoundError: if no expert of that name ships.
+    """
+    return json.loads((_WEIGHTS / f"{name}.json").read_text())
+
+
+def mean_return(name: str) -> float:
+    """Return the expert's mean undiscounted return over episodes of full length."""
+    return float(record(name)["mean_return_full_length"])
+
+
+@functools.cache
+def load_weights(name: str) -> dict[str, np.ndarray]:
+    """Return the arrays of a shipped expert.
+
+    Raises:
+        FileNotFoundError: if no expert of that name ships.
+    """
+    with (_WEIGHTS / f"{name}.npz").open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+        return dict(arrays)
+
+
+def policy(weights: dict[str, np.ndarray], obs: jax.Array) -> jax.Array:
+    """Return the deterministic action f32[..., A] for observations f32[..., O]."""
+    x = (obs - weights["obs_mean"]) / weights["obs_std"]
+    layers = sum(name.startswith("kernel") for name in weights)
+    for i in range(layers):
+        x = x @ weights[f"kernel_{i}"] + weights[f"bias_{i}"]
+        x = jax.nn.elu(x) if i < layers - 1 else jnp.tanh(x)
+    return x
+
+
+def score(env: Env, weights: dict[str, np.ndarray], *, num_episodes: int, key: jax.Array) -> tuple[np.ndarray, np.ndarray]:
+    """Run one episode a robot under a policy.
+
+    Args:
+        env: the environment.
+        weights: arrays of the policy.
+        num_episodes: robots that run side by side.
+        key: random key.
+
+    Returns:
+        f32[num_episodes] undiscounted returns, i32[num_episodes] control steps before violation or horizon.
+    """
+    key_reset, key_step = jax.random.split(key)
+    start = jax.vmap(env.reset)(jax.random.split(key_reset, num_episodes), jnp.arange(num_episodes))
+
+    def step(state, key):
+        active = ~state.violation
+        keys = jax.random.split(key, num_episodes)
+        after = jax.vmap(env.step)(state, policy(weights, state.obs), active, keys)
+        keep = lambda old, new: jnp.where(active.reshape(active.shape + (1,) * (new.ndim - 1)), new, old)  # noqa: E731
+        return jax.tree.map(keep, state, after), None
+
+    run = jax.jit(lambda state, keys: jax.lax.scan(step, state, keys)[0])
+    state = run(start, jax.random.split(key_step, env.spec.horizon))
+    return np.asarray(state.episode_return), np.asarray(state.episode_step)

@@ -39,10 +39,6 @@ SETTINGS = {
         num_minibatches=32,
         num_updates_per_batch=4,
         learning_rate=3e-4,
-        learning_rate_schedule="ADAPTIVE_KL",
-        learning_rate_schedule_min_lr=1e-4,
-        learning_rate_schedule_max_lr=6e-4,
-        desired_kl=0.02,
         clipping_epsilon=0.3,
         entropy_cost=1e-3,
         discounting=0.97,
@@ -114,7 +110,9 @@ def checkpoints(folder: Path) -> list[Path]:
     return sorted(folder.glob("checkpoint_*.msgpack"))
 
 
-def train_expert(name: str, folder: Path, *, num_timesteps: int, evaluate_every: int, seed: int) -> None:
+def train_expert(
+    name: str, folder: Path, *, num_timesteps: int, evaluate_every: int, seed: int, learning_rate: float | None
+) -> None:
     """Train until `num_timesteps` in all, from the last checkpoint if there is one."""
     folder.mkdir(parents=True, exist_ok=True)
     task = Task(envs.make_env(name, success_return=float("inf")))
@@ -146,7 +144,11 @@ def train_expert(name: str, folder: Path, *, num_timesteps: int, evaluate_every:
             if new:
                 writer.writeheader()
             writer.writerow(row)
-        print(row, {k: float(v) for k, v in metrics.items() if any(word in k for word in ("kl", "learning_rate", "sps"))}, flush=True)
+        print(
+            row,
+            {k: float(v) for k, v in metrics.items() if any(word in k for word in ("kl", "learning_rate", "sps"))},
+            flush=True,
+        )
 
     remaining = num_timesteps - done
     train.train(
@@ -162,7 +164,7 @@ def train_expert(name: str, folder: Path, *, num_timesteps: int, evaluate_every:
         progress_fn=log,
         policy_params_fn=save,
         restore_params=restore,
-        **SETTINGS[name],
+        **SETTINGS[name] | ({} if learning_rate is None else {"learning_rate": learning_rate}),
     )
 
 
@@ -201,7 +203,9 @@ def ship(name: str, folder: Path, *, candidates: int, num_episodes: int) -> None
             "mean_return": round(float(returns.mean()), 1),
             "mean_return_full_length": round(mean, 1),
             "share_full_length": round(float(full.mean()), 4),
-            "share_successful": round(float((full & (returns > max(envs.SUCCESS_FLOOR.get(name, -np.inf), 0.95 * mean))).mean()), 4),
+            "share_successful": round(
+                float((full & (returns > max(envs.SUCCESS_FLOOR.get(name, -np.inf), 0.95 * mean))).mean()), 4
+            ),
         }
         print(record, flush=True)
         if best is None or record["share_successful"] > best[0]["share_successful"]:
@@ -222,6 +226,7 @@ def main() -> None:
     parser.add_argument("--num-timesteps", type=int, default=40_000_000, help="environment steps in all")
     parser.add_argument("--evaluate-every", type=int, default=1_000_000, help="environment steps between evaluations")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--learning-rate", type=float, help="in place of the task's setting, to anneal a resumed run")
     parser.add_argument("--ship", action="store_true", help="choose the best checkpoint and write it into the package")
     parser.add_argument("--candidates", type=int, default=5, help="checkpoints to score with --ship")
     parser.add_argument("--num-episodes", type=int, default=512, help="episodes a checkpoint is scored on with --ship")
@@ -236,6 +241,7 @@ def main() -> None:
             num_timesteps=args.num_timesteps,
             evaluate_every=args.evaluate_every,
             seed=args.seed,
+            learning_rate=args.learning_rate,
         )
 
 

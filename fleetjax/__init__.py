@@ -1,0 +1,47 @@
+"""fleetjax: interactive fleet learning in JAX. N robots, M humans: who gets help, and what does the fleet gain?"""
+
+from fleetjax import envs
+from fleetjax.allocation import allocate
+from fleetjax.config import Config, make_config, validate
+from fleetjax.envs import Env, EnvSpec, list_envs, register_env
+from fleetjax.fleet import Fleet, FleetState, Plan, make_fleet
+from fleetjax.metrics import Metrics, rohe
+from fleetjax.priority import Algorithm, Priority, list_algorithms, register_algorithm, register_priority
+from fleetjax.run import Result, evaluate, prepare, run
+from fleetjax.supervisors import Supervisor, list_supervisors, register_supervisor
+from fleetjax.types import EnvState, HumanState, Signals
+from fleetjax.version import VERSION
+
+__version__ = VERSION
+__all__ = [
+    "Algorithm",
+    "Config",
+    "Env",
+    "EnvSpec",
+    "EnvState",
+    "Fleet",
+    "FleetState",
+    "HumanState",
+    "Metrics",
+    "Plan",
+    "Priority",
+    "Result",
+    "Signals",
+    "Supervisor",
+    "allocate",
+    "envs",
+    "evaluate",
+    "list_algorithms",
+    "list_envs",
+    "list_supervisors",
+    "make_config",
+    "make_fleet",
+    "prepare",
+    "register_algorithm",
+    "register_env",
+    "register_priority",
+    "register_supervisor",
+    "rohe",
+    "run",
+    "validate",
+]

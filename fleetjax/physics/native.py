@@ -65,7 +65,14 @@ class _Simulator:
         velocity = slice(1 + nq, 1 + nq + nv)
         acceleration = (after[:, velocity] - previous[:, velocity]) / dt  # damping is explicit: exactly the solver's
         failed = np.abs(after[:, 0] - before[:, 0] - self.substeps * dt) > dt / 2
-        return (after[:, 1 : 1 + nq], after[:, velocity], after[:, 1 + nq + nv :], acceleration, sensors[:, -1], after[:, :1]), failed
+        return (
+            after[:, 1 : 1 + nq],
+            after[:, velocity],
+            after[:, 1 + nq + nv :],
+            acceleration,
+            sensors[:, -1],
+            after[:, :1],
+        ), failed
 
 
 def make_step(model: mujoco.MjModel, substeps: int) -> Callable[[PhysicsState, jax.Array, jax.Array], PhysicsState]:

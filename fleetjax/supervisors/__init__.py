@@ -1,0 +1,79 @@
+"""Supervisors: simulated humans, chosen by registered names."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+
+from fleetjax.envs.base import Env
+from fleetjax.supervisors import expert
+from fleetjax.types import EnvState
+
+
+class Supervisor(NamedTuple):
+    """A human's policy for teleoperation (paper, Section 3); hard resets are the fleet's.
+
+    Attributes:
+        act: `(EnvState, key) -> f32[A]`, the action for one robot; one-hot where actions are discrete.
+    """
+
+    act: Callable[[EnvState, jax.Array], jax.Array]
+
+
+def _navigation(env: Env) -> Supervisor:
+    del env
+    from fleetjax.envs import navigation
+
+    return Supervisor(lambda state, key: navigation.teach(state))
+
+
+def _shipped(name: str) -> Callable[[Env], Supervisor]:
+    def make_supervisor(env: Env) -> Supervisor:
+        del env
+        weights = expert.load_weights(name)
+        return Supervisor(lambda state, key: expert.policy(weights, state.obs))
+
+    return make_supervisor
+
+
+_SUPERVISORS: dict[str, Callable[[Env], Supervisor]] = {"humanoid": _shipped("humanoid"), "navigation": _navigation}
+
+
+def register_supervisor(name: str, make_supervisor: Callable[[Env], Supervisor]) -> None:
+    """Make a supervisor available to configs, and to environments whose `spec.supervisor` names it.
+
+    Args:
+        name: what users call it.
+        make_supervisor: `env -> Supervisor`.
+
+    Raises:
+        ValueError: if the name is taken.
+    """
+    if name in _SUPERVISORS:
+        raise ValueError(f"supervisor = {name!r} is registered already; choose another name")
+    _SUPERVISORS[name] = make_supervisor
+
+
+def list_supervisors() -> tuple[str, ...]:
+    """Return the registered names."""
+    return tuple(_SUPERVISORS)
+
+
+def check(name: str) -> None:
+    """Raise a ValueError with the closest names unless `name` is registered."""
+    if not name:
+        raise ValueError("supervisor = '' and the environment names none; register one and pass its name")
+    if name not in _SUPERVISORS:
+        from fleetjax.priority import unknown
+
+        raise ValueError(unknown("supervisor", name, _SUPERVISORS))
+
+
+def make(name: str, env: Env) -> Supervisor:
+    """Return the supervisor `name` for an environment.
+
+    Raises:
+        ValueError: if the name is unknown.
+    """
+    check(name)
+    return _SUPERVISORS[name](env)

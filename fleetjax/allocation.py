@@ -1,0 +1,76 @@
+"""Who helps whom: Fleet-DAgger's allocation of humans to robots (paper, Algorithm 1)."""
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from fleetjax.types import HumanState
+
+
+def allocate(
+    score: jax.Array,
+    humans: HumanState,
+    min_time: jax.Array,
+    key: jax.Array,
+    available: jax.Array | None = None,
+) -> HumanState:
+    """Assign humans to the robots with the highest positive scores.
+
+    A human whose intervention is younger than its minimum time is bound: it stays, and its robot leaves the
+    competition. The other robots with positive scores get the other humans, highest score first. A human whose robot is
+    chosen again stays with it; the rest of the chosen robots go to the rest of the humans in order. Ties are broken at random.
+
+    Args:
+        score: f32[N] priority of each robot; 0 or NaN = no help.
+        humans: HumanState[M] at the end of the last timestep.
+        min_time: i32[N] shortest intervention on each robot (timesteps).
+        key: random key, for ties.
+        available: bool[M] humans who are there; None = all.
+
+    Returns:
+        HumanState[M]: `duration` is unchanged for a human that stays and 0 for one newly assigned or free.
+
+    >>> idle = HumanState(robot=jnp.full(2, -1), duration=jnp.zeros(2, jnp.int32))
+    >>> allocate(jnp.array([0.0, 2.0, 1.0, 3.0]), idle, jnp.full(4, 5), jax.random.key(0)).robot.tolist()
+    [3, 1]
+
+    Reference: Fleet-DAgger, Section 4.1 and Appendix (Algorithm 1).
+    """
+    num_robots, num_humans = score.shape[0], humans.robot.shape[0]
+    chex.assert_shape([score, min_time], (num_robots,))
+    chex.assert_shape([humans.robot, humans.duration], (num_humans,))
+    if available is None:
+        available = jnp.ones(num_humans, bool)
+    nobody = -jnp.ones((), humans.robot.dtype)
+
+    assigned = available & (humans.robot >= 0)
+    bound = assigned & (humans.duration < min_time[humans.robot])
+    unlocked = available & ~bound
+
+    competing = jnp.where(score > 0, score, 0.0)  # a NaN is not > 0
+    competing = competing.at[jnp.where(bound, humans.robot, num_robots)].set(0.0, mode="drop")
+    order = jax.random.permutation(key, num_robots)
+    best, rank = jax.lax.top_k(competing[order], min(num_humans, num_robots))
+    chosen = order[rank]
+    is_chosen = (best > 0) & (jnp.arange(chosen.size) < jnp.sum(unlocked))
+
+    chosen_robots = jnp.zeros(num_robots, bool).at[chosen].set(is_chosen)
+    stays = unlocked & assigned & chosen_robots[humans.robot]
+    kept_robots = jnp.zeros(num_robots, bool).at[jnp.where(stays, humans.robot, num_robots)].set(True, mode="drop")
+
+    is_new = is_chosen & ~kept_robots[chosen]
+    place = jnp.where(is_new, jnp.cumsum(is_new) - 1, num_humans)
+    queue = jnp.full(num_humans, nobody).at[place].set(chosen.astype(nobody.dtype), mode="drop")
+    waiting = unlocked & ~stays
+    turn = jnp.cumsum(waiting) - 1
+
+    keeps = bound | stays
+    robot = jnp.where(keeps, humans.robot, jnp.where(waiting, queue[turn], nobody))
+    return HumanState(robot=robot, duration=jnp.where(keeps, humans.duration, 0))
+
+
+def helper_of(humans: HumanState, num_robots: int) -> jax.Array:
+    """Return i32[N], the human that helps each robot, -1 = none."""
+    num_humans = humans.robot.shape[0]
+    place = jnp.where(humans.robot >= 0, humans.robot, num_robots)
+    return jnp.full(num_robots, -1, jnp.int32).at[place].set(jnp.arange(num_humans, dtype=jnp.int32), mode="drop")

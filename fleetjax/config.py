@@ -1,0 +1,242 @@
+"""Every parameter of a run: its meaning, unit, default, and whether changing it compiles anew.
+
+Static fields shape the program. Traced fields are arrays: `vmap` over them sweeps them in one compilation. Defaults are the
+paper's (Section 5.2 and Appendix); environments change some of them, see `fleetjax.list_envs`.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fleetjax import envs, priority, supervisors
+from fleetjax.physics.base import BACKENDS
+
+
+class Field(NamedTuple):
+    """What is known of a `Config` field besides its default.
+
+    Attributes:
+        help: meaning.
+        unit: unit, or "".
+        kind: `str`, `int`, `float`, `bool` or `tuple`.
+        traced: whether it is an array that can be swept without compiling anew.
+        low: smallest allowed value.
+        high: largest allowed value.
+    """
+
+    help: str
+    unit: str
+    kind: type
+    traced: bool
+    low: float | None
+    high: float | None
+
+
+def _static(default: Any, help: str, unit: str = "", *, low: float | None = None) -> Any:
+    field = Field(help, unit, type(default), False, low, None)
+    return dataclasses.field(default=default, metadata={"field": field})
+
+
+def _traced(default: Any, help: str, unit: str = "", *, low: float | None = 0, high: float | None = None) -> Any:
+    field = Field(help, unit, type(default), True, low, high)
+    return dataclasses.field(default=default, metadata={"field": field})
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Parameters of a run. Make one with `make_config`; change one with `replace`."""
+
+    environment: str = _static("humanoid", "registered environment")
+    algorithm: str = _static("cur", "registered algorithm, or an order of the letters c, u, r")
+    supervisor: str = _static("", "registered supervisor; empty = the environment's own")
+    backend: str = _static("auto", "physics backend: native (CPU threads), mjx (pure JAX), auto")
+    num_robots: int = _static(100, "robots N", low=1)
+    num_humans: int = _static(10, "human supervisors M, at most N", low=1)
+    num_steps: int = _static(10_000, "operation time T", "timesteps", low=1)
+    ensemble_size: int = _static(5, "networks in the policy ensemble E (discrete actions: 1)", low=1)
+    hidden_sizes: tuple[int, ...] = _static((256, 256), "units of the hidden layers of policy and critics")
+    batch_size: int = _static(256, "samples a gradient step", low=1)
+    gradient_steps: int = _static(1, "gradient steps a timestep", low=0)
+    human_capacity: int = _static(0, "room for human data; 0 = all that a run can give", "pairs", low=0)
+    critic_capacity: int = _static(250_000, "room of the ring of critic data, at least N", "transitions", low=1)
+
+    min_teleop_time: int = _traced(5, "shortest teleoperation t_T", "timesteps", low=1)
+    hard_reset_time: int = _traced(5, "duration of a hard reset t_R", "timesteps", low=1)
+    initial_period: int = _traced(0, "time t_I before orders with C help robots in violation", "timesteps")
+    uncertainty_threshold: float = _traced(0.05, "uncertainty below which U is 0", high=1)
+    risk_threshold: float = _traced(0.5, "risk below which R is 0", high=1)
+    random_threshold: float = _traced(0.9, "priority of `random` below which it is 0", high=1)
+    thrifty_weight: float = _traced(0.25, "weight of the chance of failure in `thrifty_dagger`", high=1)
+    thrifty_threshold: float = _traced(3.25, "normalised priority of `thrifty_dagger` at or below which it is 0")
+    learning_rate: float = _traced(3e-4, "Adam's learning rate, policy and critics")
+    normalize_observations: bool = _traced(True, "scale observations by the demonstrations' mean and deviation")
+    num_demonstrations: int = _traced(5000, "offline pairs from whole supervisor episodes", "pairs", low=1)
+    extra_demonstrations: int = _traced(0, "offline pairs on top (the constraint baseline)", "pairs")
+    pretraining_steps: int = _traced(1000, "gradient steps on the demonstrations", "gradient steps")
+    critic_pretraining_steps: int = _traced(3000, "gradient steps on the offline transitions", "gradient steps")
+    num_critic_transitions: int = _traced(20_000, "offline transitions for the critic", "transitions")
+    critic_noise: float = _traced(0.25, "deviation of the noise on actions in those transitions")
+    positive_fraction: float = _traced(0.25, "share of positives in a critic batch", high=1)
+    risk_discount: float = _traced(0.5, "discount of the safety critic", high=1)
+    goal_discount: float = _traced(0.999, "discount of the goal critic", high=1)
+    target_rate: float = _traced(2e-4, "rate at which target networks follow, each gradient step", high=1)
+
+    def replace(self, **changes: Any) -> "Config":
+        """Return a config with some fields changed; traced ones become i32, f32 or bool scalars.
+
+        Raises:
+            ValueError: if a field is unknown or an integer field gets a value that is none.
+        """
+        for name in changes:
+            if name not in FIELDS:
+                raise ValueError(priority.unknown("config field", name, FIELDS))
+        changed = dataclasses.replace(self, **{name: _typed(name, value) for name, value in changes.items()})
+        if "human_capacity" in changes and changed.human_capacity:
+            return changed
+        return dataclasses.replace(changed, human_capacity=max(changed.human_capacity, needed_human_capacity(changed)))
+
+
+FIELDS: dict[str, Field] = {f.name: f.metadata["field"] for f in dataclasses.fields(Config)}
+_TRACED = [name for name, field in FIELDS.items() if field.traced]
+_STATIC = [name for name, field in FIELDS.items() if not field.traced]
+jax.tree_util.register_dataclass(Config, data_fields=_TRACED, meta_fields=_STATIC)
+
+
+def _typed(name: str, value: Any) -> Any:
+    field = FIELDS[name]
+    if not field.traced:
+        if field.kind is tuple:
+            value = tuple(value)
+            valid = all(isinstance(size, (int, np.integer)) for size in value)
+        else:
+            valid = isinstance(value, field.kind) or (field.kind is int and isinstance(value, np.integer))
+        if not valid or isinstance(value, bool):
+            raise ValueError(f"{name} = {value!r} must be of type {field.kind.__name__}")
+        return int(value) if field.kind is int else value
+    try:
+        array = jnp.asarray(value)
+    except TypeError:
+        raise ValueError(f"{name} = {value!r} must be a number") from None
+    if field.kind is int and not jnp.issubdtype(array.dtype, jnp.integer):
+        whole = _is_concrete(array) and np.all(np.asarray(array) == np.round(np.asarray(array)))
+        if not whole:
+            raise ValueError(f"{name} = {value!r} must be a whole number of {field.unit}")
+    if field.kind is bool and array.dtype != jnp.bool_:
+        raise ValueError(f"{name} = {value!r} must be True or False")
+    return array.astype({int: jnp.int32, float: jnp.float32, bool: jnp.bool_}[field.kind])
+
+
+def _is_concrete(value: Any) -> bool:
+    return not isinstance(value, jax.core.Tracer)
+
+
+def needed_human_capacity(config: Config) -> int:
+    """Return how many pairs a run can collect; demonstrations count where they are concrete."""
+    algorithm = priority.get_algorithm(config.algorithm)
+    pairs = config.num_humans * config.num_steps if algorithm.updates else 0
+    offline = (config.num_demonstrations, config.extra_demonstrations)
+    if algorithm.pretrains and all(map(_is_concrete, offline)):
+        pairs += int(np.max(np.asarray(offline[0]) + np.asarray(offline[1])))
+    return max(pairs, 1)
+
+
+def make_config(environment: "str | envs.Env", algorithm: str = "cur", **overrides: Any) -> Config:
+    """Return the configuration of an experiment, with the paper's defaults for this environment and algorithm.
+
+    Args:
+        environment: registered name, or an `Env` to be passed to `run` as well.
+        algorithm: registered name.
+        **overrides: fields of `Config`.
+
+    Raises:
+        ValueError: if a name or a field is unknown, or a value is out of range.
+
+    >>> config = make_config("navigation", "cur", num_robots=20)
+    >>> config.num_robots, int(config.min_teleop_time)
+    (20, 5)
+
+    Reference: paper, Section 5.2 and Appendix (simulation hyper-parameters).
+    """
+    if isinstance(environment, envs.Env):
+        name, defaults = environment.spec.name, {}
+    else:
+        name, defaults = environment, envs.get_defaults(environment)
+    priority.get_algorithm(algorithm)
+    fields = {f.name: f.default for f in dataclasses.fields(Config)} | dict(defaults)
+    fields |= {"environment": name, "algorithm": algorithm} | overrides
+    if algorithm == "expert" and "num_humans" not in overrides:
+        fields["num_humans"] = fields["num_robots"]
+    if algorithm == "constraint":  # as many gradient steps as the online arms, and as many human timesteps
+        budget = {"pretraining_steps": fields["pretraining_steps"] + fields["num_steps"] * fields["gradient_steps"]}
+        budget["extra_demonstrations"] = envs.CUR_HUMAN_TIME.get(name, 0)
+        fields |= {k: v for k, v in budget.items() if k not in overrides}
+    config = Config().replace(**fields)
+    validate(config, environment if isinstance(environment, envs.Env) else None)
+    return config
+
+
+def validate(config: Config, env: "envs.Env | None" = None) -> None:
+    """Check a configuration in plain Python, before anything is computed. Traced fields are checked where concrete.
+
+    Args:
+        config: the configuration.
+        env: the environment, if it is not the registered one that the configuration names.
+
+    Raises:
+        ValueError: naming the field, its value and what is allowed.
+    """
+    for name, field in FIELDS.items():
+        _check_range(name, getattr(config, name), field)
+    if config.num_humans > config.num_robots:
+        raise ValueError(
+            f"num_humans = {config.num_humans} is more than num_robots = {config.num_robots}; a human helps one robot at a time"
+        )
+    if not config.hidden_sizes or min(config.hidden_sizes) < 1:
+        raise ValueError(f"hidden_sizes = {config.hidden_sizes} must name one or more layers of at least 1 unit")
+    if config.backend not in BACKENDS:
+        raise ValueError(priority.unknown("backend", config.backend, BACKENDS))
+    algorithm = priority.get_algorithm(config.algorithm)
+    if config.algorithm == "expert" and config.num_humans != config.num_robots:
+        raise ValueError(
+            f"num_humans = {config.num_humans} must equal num_robots = {config.num_robots} for algorithm = 'expert', "
+            "which teleoperates every robot"
+        )
+    if algorithm.critics and config.critic_capacity < config.num_robots:
+        raise ValueError(f"critic_capacity = {config.critic_capacity} must be at least num_robots = {config.num_robots}")
+    if algorithm.pretrains or algorithm.updates:
+        _check_data(config, algorithm)
+    env = env or envs.make(config.environment, config.backend)
+    supervisors.check(config.supervisor or env.spec.supervisor)
+    if "goal" in algorithm.critics and not env.spec.has_goal:
+        raise ValueError(
+            f"algorithm = {config.algorithm!r} needs a goal to learn from, and environment = {env.spec.name!r} has none; "
+            "choose another algorithm, or an environment with goals"
+        )
+
+
+def _check_range(name: str, value: Any, field: Field) -> None:
+    if field.kind in (str, tuple, bool) or not _is_concrete(value):
+        return
+    values = np.asarray(value)
+    low, high = field.low, field.high
+    if np.all(np.isfinite(values)) and (low is None or np.all(values >= low)) and (high is None or np.all(values <= high)):
+        return
+    allowed = f"in [{low}, {high}]" if high is not None else f"at least {low}"
+    shown = values if values.ndim else values.item()
+    raise ValueError(f"{name} = {shown} must be {allowed}{' ' + field.unit if field.unit else ''}")
+
+
+def _check_data(config: Config, algorithm: priority.Algorithm) -> None:
+    if not all(map(_is_concrete, (config.num_demonstrations, config.extra_demonstrations))):
+        return
+    pairs = np.min(np.asarray(config.num_demonstrations) + np.asarray(config.extra_demonstrations))
+    if algorithm.pretrains and config.batch_size > pairs:
+        raise ValueError(
+            f"batch_size = {config.batch_size} is larger than the data: num_demonstrations + extra_demonstrations = {pairs}"
+        )
+    needed = needed_human_capacity(config)
+    if config.human_capacity < needed:
+        raise ValueError(f"human_capacity = {config.human_capacity} is less than the {needed} pairs that this run can give")

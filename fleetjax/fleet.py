@@ -1,0 +1,210 @@
+"""The fleet's timestep: signals, priorities, allocation, actions, physics, data, resets, learning (paper, Section 3).
+
+`Fleet.plan` says who needs whom, `Fleet.advance` does the rest, and `Fleet.step` puts the simulated supervisor between
+them. This is the only module that maps over robots.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from fleetjax import priority, supervisors, tree
+from fleetjax.allocation import allocate, helper_of
+from fleetjax.config import Config
+from fleetjax.envs import Env
+from fleetjax.learning import critic, imitation
+from fleetjax.metrics import Metrics
+from fleetjax.types import EnvState, HumanState, Signals
+
+
+class FleetState(NamedTuple):
+    """All that the next timestep needs.
+
+    Attributes:
+        timestep: i32[] timesteps completed.
+        env: EnvState[N].
+        humans: HumanState[M] at the end of the last timestep.
+        resetting: bool[N] type of each robot's last intervention: hard reset, or teleoperation.
+        learner: the robots' policy.
+        human_data: what it learns from.
+        critics: `CriticState` by kind, those that the algorithm needs.
+        priority: the priority's own memory.
+    """
+
+    timestep: jax.Array
+    env: EnvState
+    humans: HumanState
+    resetting: jax.Array
+    learner: imitation.LearnerState
+    human_data: imitation.HumanData
+    critics: dict[str, critic.CriticState]
+    priority: Any
+
+
+class Plan(NamedTuple):
+    """Who needs whom at this timestep.
+
+    Attributes:
+        signals: Signals[N] that the scores were made from.
+        score: f32[N] priorities.
+        humans: HumanState[M], the allocation; `duration` counts the timesteps before this one.
+        teleoperated: bool[N] robots that a human teleoperates.
+        resetting: bool[N] robots that a human resets.
+    """
+
+    signals: Signals
+    score: jax.Array
+    humans: HumanState
+    teleoperated: jax.Array
+    resetting: jax.Array
+
+
+class Fleet(NamedTuple):
+    """Pure functions of a fleet. Keys: one a timestep, `fold_in(key, t)`.
+
+    Attributes:
+        plan: `(state, key, available bool[M] | None) -> (state, Plan)`.
+        advance: `(state, Plan, human_action f32[N, A], given bool[N], key) -> (state, Metrics)`. `given` marks robots whose
+            supervisor really gave that action; on other robots the policy acts, and nothing is recorded.
+        step: `(state, key) -> (state, Metrics)`, with the simulated supervisor.
+    """
+
+    plan: Callable[..., tuple[FleetState, Plan]]
+    advance: Callable[..., tuple[FleetState, Metrics]]
+    step: Callable[[FleetState, jax.Array], tuple[FleetState, Metrics]]
+
+
+def make_fleet(config: Config, env: Env) -> Fleet:
+    """Compose environment, policy, critics, priority and supervisor into the timestep of a fleet."""
+    algorithm = priority.get_algorithm(config.algorithm)
+    rule = algorithm.make_priority(config)
+    supervisor = supervisors.make(config.supervisor or env.spec.supervisor, env)
+    learner = imitation.make_learner(config, env.spec)
+    critics = {kind: critic.make_critic(kind, config, env.spec, learner) for kind in algorithm.critics}
+    num_robots = config.num_robots
+    robots = jnp.arange(num_robots)
+
+    def observe(state: FleetState) -> Signals:
+        obs = state.env.obs
+        action = learner.act(state.learner, obs)
+        chance = {kind: c.value(state.critics[kind], state.learner.normalizer, obs, action) for kind, c in critics.items()}
+        never = jnp.zeros(num_robots)
+        return Signals(
+            violation=state.env.violation,
+            uncertainty=learner.uncertainty(state.learner, obs),
+            risk=chance.get("safety", never),
+            goal=chance.get("goal", never),
+            timestep=state.timestep,
+        )
+
+    def plan(state: FleetState, key: jax.Array, available: jax.Array | None = None) -> tuple[FleetState, Plan]:
+        key_score, key_ties = jax.random.split(key)
+        signals = observe(state)
+        score, memory = rule.score(signals, state.priority, key_score)
+        min_time = jnp.where(state.resetting, config.hard_reset_time, config.min_teleop_time)
+        humans = allocate(score, state.humans, min_time, key_ties, available)
+        helped = helper_of(humans, num_robots) >= 0
+        resetting, teleoperated = helped & signals.violation, helped & ~signals.violation
+        humans = _restart_clocks(humans, state.resetting, resetting, config.hard_reset_time)
+        return state._replace(priority=memory), Plan(signals, score, humans, teleoperated, resetting)
+
+    def advance(
+        state: FleetState, plan: Plan, human_action: jax.Array, given: jax.Array, key: jax.Array
+    ) -> tuple[FleetState, Metrics]:
+        chex.assert_shape(human_action, (num_robots, env.spec.action_size))
+        key_env, key_reset, key_goal, key_data, key_learn = jax.random.split(key, 5)
+        given = given & plan.teleoperated
+        moving = ~state.env.violation
+        obs = state.env.obs
+        action = jnp.where(given[:, None], human_action, learner.act(state.learner, obs))
+
+        keys = jax.random.split(key_env, num_robots)
+        stepped = tree.where(moving, jax.vmap(env.step)(state.env, action, moving, keys), state.env)
+        humans = plan.humans._replace(duration=jnp.where(plan.humans.robot >= 0, plan.humans.duration + 1, 0))
+
+        human_data, critic_states = state.human_data, state.critics
+        if algorithm.updates:
+            human_data = imitation.append(human_data, imitation.Pair(obs, human_action), given, key_data)
+        steps = critic.Transition(obs, action, stepped.obs, stepped.violation, stepped.success)
+        critic_states = {kind: c.append(critic_states[kind], steps, moving) for kind, c in critics.items()}
+
+        helper = helper_of(humans, num_robots)
+        reset_done = plan.resetting & (humans.duration[helper] >= config.hard_reset_time)
+        ended = stepped.timeout if env.next_goal else stepped.timeout | stepped.success
+        fresh = jax.vmap(env.reset)(jax.random.split(key_reset, num_robots), robots)
+        after = tree.where(reset_done | (moving & ended), fresh, stepped)
+        if env.next_goal:
+            renewed = jax.vmap(env.next_goal)(after, jax.random.split(key_goal, num_robots))
+            after = tree.where(moving & stepped.success & ~ended, renewed, after)
+
+        policy, loss = state.learner, jnp.zeros(())
+        if algorithm.updates:
+            policy, critic_states, loss = learn(policy, human_data, critic_states, key_learn)
+
+        metrics = _measure(config, state, plan, stepped, moving, reset_done, loss)
+        state = FleetState(state.timestep + 1, after, humans, plan.resetting, policy, human_data, critic_states, state.priority)
+        return state, metrics
+
+    def learn(policy, human_data, critic_states, key):
+        """Take the timestep's gradient steps, policy first."""
+
+        def gradient_step(carry, key):
+            policy, states = carry
+            key_policy, key_critics = jax.random.split(key)
+            policy, loss = learner.update(policy, human_data, key_policy)
+            states = {kind: c.update(states[kind], policy, key_critics) for kind, c in critics.items()}
+            return (policy, states), loss
+
+        keys = jax.random.split(key, config.gradient_steps)
+        (policy, critic_states), losses = jax.lax.scan(gradient_step, (policy, critic_states), keys)
+        return policy, critic_states, jnp.sum(losses) / max(config.gradient_steps, 1)
+
+    def step(state: FleetState, key: jax.Array) -> tuple[FleetState, Metrics]:
+        key_plan, key_human, key_advance = jax.random.split(key, 3)
+        state, plan_ = plan(state, key_plan)
+        human_action = jax.vmap(supervisor.act)(state.env, jax.random.split(key_human, num_robots))
+        return advance(state, plan_, human_action, plan_.teleoperated, key_advance)
+
+    return Fleet(plan, advance, step)
+
+
+def _restart_clocks(
+    humans: HumanState, was_resetting: jax.Array, resetting: jax.Array, hard_reset_time: jax.Array
+) -> HumanState:
+    """Return `humans` with duration 0 where the kind of intervention changes, or a completed hard reset is followed by another."""
+    changed = was_resetting[humans.robot] != resetting[humans.robot]
+    completed = was_resetting[humans.robot] & (humans.duration >= hard_reset_time)
+    return humans._replace(duration=jnp.where(changed | completed, 0, humans.duration))
+
+
+def _measure(
+    config: Config, state: FleetState, plan: Plan, stepped: EnvState, moving: jax.Array, reset_done: jax.Array, loss: jax.Array
+) -> Metrics:
+    """Count what happened in a timestep that began in `state` and led to `stepped`, before resets."""
+
+    def count(mask: jax.Array) -> jax.Array:
+        return jnp.sum(mask, dtype=jnp.int32)
+
+    helper = helper_of(plan.humans, config.num_robots)
+    switched = helper != helper_of(state.humans, config.num_robots)
+    chosen = switched & (helper >= 0)
+    certain = plan.signals.uncertainty < config.uncertainty_threshold
+    at_risk = plan.signals.risk >= config.risk_threshold
+    return Metrics(
+        successes=count(moving & stepped.success),
+        violations=count(moving & stepped.violation),
+        hard_resets=count(reset_done),
+        idle=count(~moving),
+        human_steps=count(helper >= 0),
+        teleop_steps=count(plan.teleoperated),
+        switches=count(switched),
+        moving=count(moving),
+        choices=count(chosen),
+        risk_choices=count(chosen & moving & certain & at_risk),
+        reward=jnp.sum(jnp.where(moving, stepped.reward, 0.0)),
+        uncertainty=jnp.sum(jnp.where(moving, plan.signals.uncertainty, 0.0)) / jnp.maximum(count(moving), 1),
+        policy_loss=loss,
+    )

@@ -1,0 +1,52 @@
+"""A store of rows that grows in place inside a scan: time per step does not depend on its capacity."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+
+class Buffer(NamedTuple):
+    """Rows in order of arrival.
+
+    Attributes:
+        rows: pytree of arrays [capacity, ...].
+        added: i32[] rows added so far, in all.
+    """
+
+    rows: Any
+    added: jax.Array
+
+    @property
+    def capacity(self) -> int:
+        """Number of slots."""
+        return jax.tree.leaves(self.rows)[0].shape[0]
+
+    @property
+    def size(self) -> jax.Array:
+        """i32[] rows that can be read."""
+        return jnp.minimum(self.added, self.capacity)
+
+
+def create(example: Any, capacity: int) -> Buffer:
+    """Return an empty buffer for rows like `example`, a pytree of unbatched arrays or shape structs."""
+    rows = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), example)
+    return Buffer(rows, jnp.zeros((), jnp.int32))
+
+
+def append(buffer: Buffer, rows: Any, mask: jax.Array, *, overwrite: bool) -> Buffer:
+    """Add the rows where `mask` holds, in order.
+
+    Args:
+        buffer: the store.
+        rows: pytree of arrays [K, ...], K <= capacity if `overwrite`.
+        mask: bool[K].
+        overwrite: when full, whether new rows take the place of the oldest (a ring) or are dropped.
+    """
+    place = buffer.added + jnp.cumsum(mask, dtype=jnp.int32) - 1
+    if overwrite:
+        place = place % buffer.capacity
+    slot = jnp.where(mask, place, buffer.capacity)  # out of range: dropped
+    stored = jax.tree.map(lambda old, new: old.at[slot].set(new.astype(old.dtype), mode="drop"), buffer.rows, rows)
+    added = buffer.added + jnp.sum(mask, dtype=jnp.int32)
+    return Buffer(stored, added if overwrite else jnp.minimum(added, buffer.capacity))

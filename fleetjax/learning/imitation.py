@@ -1,0 +1,123 @@
+"""The robots' policy: an ensemble that imitates human data, each member its own bootstrap (paper, Sections 3 and 4.2).
+
+Continuous actions: members regress the action and act with their mean; uncertainty is their variance. Discrete
+actions: one classifier; uncertainty is its entropy.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from fleetjax.config import Config
+from fleetjax.envs import EnvSpec
+from fleetjax.learning import buffer
+from fleetjax.learning.networks import MLP, Normalizer
+from fleetjax.tree import take
+
+
+class Pair(NamedTuple):
+    """An observation f32[O] and what a human did there, action f32[A]."""
+
+    obs: jax.Array
+    action: jax.Array
+
+
+class HumanData(NamedTuple):
+    """All human data so far.
+
+    Attributes:
+        pairs: Buffer of `Pair`.
+        resample: i32[E, capacity] for each member, the pairs that it learns from; `pairs.size` of them count.
+    """
+
+    pairs: buffer.Buffer
+    resample: jax.Array
+
+
+class LearnerState(NamedTuple):
+    """Parameters [E, ...] and optimizer state of the ensemble, and the normalizer of observations."""
+
+    params: Any
+    opt_state: Any
+    normalizer: Normalizer
+
+
+class Learner(NamedTuple):
+    """Pure functions of the ensemble.
+
+    Attributes:
+        init: `(key, Normalizer) -> LearnerState`.
+        act: `(LearnerState, obs f32[..., O]) -> f32[..., A]`.
+        uncertainty: `(LearnerState, obs f32[..., O]) -> f32[...]` in [0, 1] (discrete: in nats).
+        update: `(LearnerState, HumanData, key) -> (LearnerState, loss f32[])`, one gradient step.
+    """
+
+    init: Any
+    act: Any
+    uncertainty: Any
+    update: Any
+
+
+def create_data(spec: EnvSpec, *, ensemble_size: int, capacity: int) -> HumanData:
+    """Return an empty data set."""
+    example = Pair(
+        jax.ShapeDtypeStruct((spec.observation_size,), jnp.float32), jax.ShapeDtypeStruct((spec.action_size,), jnp.float32)
+    )
+    return HumanData(buffer.create(example, capacity), jnp.zeros((ensemble_size, capacity), jnp.int32))
+
+
+def append(data: HumanData, pairs: Pair, mask: jax.Array, key: jax.Array) -> HumanData:
+    """Add the pairs [K] where `mask` bool[K] holds. For each, every member resamples one of all pairs so far.
+
+    Reference: paper, Section 4.2 (ensemble bootstrapped on subsets of the training data).
+    """
+    grown = buffer.append(data.pairs, pairs, mask, overwrite=False)
+    members = data.resample.shape[0]
+    draws = jax.random.randint(key, (members, mask.shape[0]), 0, jnp.maximum(grown.size, 1))
+    index = buffer.Buffer(data.resample.T, data.pairs.added)
+    return HumanData(grown, buffer.append(index, draws.T, mask, overwrite=False).rows.T)
+
+
+def make_learner(config: Config, spec: EnvSpec) -> Learner:
+    """Build the ensemble for a configuration and an environment."""
+    members = 1 if spec.discrete else config.ensemble_size
+    network = MLP(config.hidden_sizes, spec.action_size)
+    optimizer = optax.scale_by_adam()
+
+    def init(key: jax.Array, normalizer: Normalizer) -> LearnerState:
+        params = jax.vmap(lambda k: network.init(k, normalizer.mean))(jax.random.split(key, members))
+        return LearnerState(params, optimizer.init(params), normalizer)
+
+    def outputs(params: Any, obs: jax.Array) -> jax.Array:
+        """f32[E, ..., A] actions, or logits of the classifier; `obs` is normalised."""
+        raw = jax.vmap(network.apply, in_axes=(0, None))(params, obs)
+        return raw if spec.discrete else jnp.tanh(raw)
+
+    def act(state: LearnerState, obs: jax.Array) -> jax.Array:
+        mean = jnp.mean(outputs(state.params, state.normalizer(obs)), axis=0)
+        return jax.nn.one_hot(jnp.argmax(mean, axis=-1), spec.action_size) if spec.discrete else mean
+
+    def uncertainty(state: LearnerState, obs: jax.Array) -> jax.Array:
+        answers = outputs(state.params, state.normalizer(obs))
+        if spec.discrete:
+            log_p = jax.nn.log_softmax(answers[0])
+            return -jnp.sum(jnp.exp(log_p) * log_p, axis=-1)
+        return jnp.mean(jnp.var(answers, axis=0), axis=-1)  # the largest variance on [-1, 1] is 1
+
+    def loss(params: Any, obs: jax.Array, action: jax.Array) -> jax.Array:
+        answer = network.apply(params, obs)
+        if spec.discrete:
+            return jnp.mean(optax.softmax_cross_entropy(answer, action))
+        return jnp.mean((jnp.tanh(answer) - action) ** 2)
+
+    def update(state: LearnerState, data: HumanData, key: jax.Array) -> tuple[LearnerState, jax.Array]:
+        draw = jax.random.randint(key, (members, config.batch_size), 0, jnp.maximum(data.pairs.size, 1))
+        batch = take(data.pairs.rows, jnp.take_along_axis(data.resample, draw, axis=1))
+        losses, grads = jax.vmap(jax.value_and_grad(loss))(state.params, state.normalizer(batch.obs), batch.action)
+        steps, opt_state = optimizer.update(grads, state.opt_state)
+        params = jax.tree.map(lambda p, step: p - config.learning_rate * step, state.params, steps)
+        return state._replace(params=params, opt_state=opt_state), jnp.mean(losses)
+
+    return Learner(init, act, uncertainty, update)

@@ -1,0 +1,148 @@
+"""Before the fleet starts: demonstrations, the first clone, and offline transitions for the critics (paper, Appendix)."""
+
+import jax
+import jax.numpy as jnp
+
+from fleetjax import priority, supervisors, tree
+from fleetjax.config import Config
+from fleetjax.envs import Env
+from fleetjax.learning import critic, imitation
+from fleetjax.learning.networks import fit_normalizer
+from fleetjax.types import EnvState
+
+LANES = 8  # episodes that are demonstrated side by side
+BURST = 20  # timesteps of offline transitions between two looks at their number
+
+
+def collect_demonstrations(
+    config: Config, env: Env, supervisor: supervisors.Supervisor, data: imitation.HumanData, key: jax.Array
+) -> imitation.HumanData:
+    """Fill `data` with supervisor actions from whole episodes, the last one cut at the number that is asked for."""
+    lanes = jnp.arange(LANES)
+
+    def step(carry: tuple[EnvState, jax.Array], key: jax.Array):
+        state, running = carry
+        key_act, key_env, key_goal = jax.random.split(key, 3)
+        action = jax.vmap(supervisor.act)(state, jax.random.split(key_act, LANES))
+        pair = imitation.Pair(state.obs, action)
+        after = jax.vmap(env.step)(state, action, running, jax.random.split(key_env, LANES))
+        ended = after.violation | after.timeout | (after.success & (env.next_goal is None))
+        if env.next_goal:
+            renewed = jax.vmap(env.next_goal)(after, jax.random.split(key_goal, LANES))
+            after = tree.where(after.success, renewed, after)
+        return (tree.where(running, after, state), running & ~ended), (pair, running)
+
+    def episodes(carry: tuple[imitation.HumanData, jax.Array]):
+        data, count = carry
+        key_reset, key_steps, key_data = jax.random.split(jax.random.fold_in(key, count), 3)
+        start = jax.vmap(env.reset)(jax.random.split(key_reset, LANES), lanes)
+        keys = jax.random.split(key_steps, env.spec.horizon)
+        _, (pairs, valid) = jax.lax.scan(step, (start, jnp.ones(LANES, bool)), keys)
+        # Episode after episode, each in order of time.
+        pairs, valid = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]), (pairs, valid))
+        valid &= data.pairs.added + jnp.cumsum(valid) <= wanted
+        return imitation.append(data, pairs, valid, key_data), count + 1
+
+    wanted = config.num_demonstrations + config.extra_demonstrations
+    unfinished = lambda carry: carry[0].pairs.added < jnp.minimum(wanted, config.human_capacity)  # noqa: E731
+    return jax.lax.while_loop(unfinished, episodes, (data, jnp.int32(0)))[0]
+
+
+def collect_transitions(config: Config, env: Env, act, add, store: critic.CriticState, key: jax.Array) -> critic.CriticState:
+    """Add about `num_critic_transitions` steps of a fleet under noisy actions; robots that end an episode are reset at once.
+
+    Args:
+        config: configuration.
+        env: environment.
+        act: `(EnvState[L], key) -> f32[L, A]`.
+        add: the critic's `append`.
+        store: the critic.
+        key: random key.
+    """
+    num_lanes = min(config.num_robots, 100)
+    lanes = jnp.arange(num_lanes)
+    key_start, key_bursts = jax.random.split(key)
+
+    def step(carry, key):
+        state, store, count = carry
+        key_act, key_noise, key_env, key_reset = jax.random.split(key, 4)
+        action = disturb(config, env, act(state, key_act), key_noise)
+        after = jax.vmap(env.step)(state, action, jnp.ones(num_lanes, bool), jax.random.split(key_env, num_lanes))
+        transition = critic.Transition(state.obs, action, after.obs, after.violation, after.success)
+        wanted = count + lanes < config.num_critic_transitions
+        store = add(store, transition, wanted)
+        ended = after.violation | after.timeout | after.success
+        fresh = jax.vmap(env.reset)(jax.random.split(key_reset, num_lanes), lanes)
+        return (tree.where(ended, fresh, after), store, count + num_lanes), None
+
+    def burst(carry):
+        keys = jax.random.split(jax.random.fold_in(key_bursts, carry[2]), BURST)
+        return jax.lax.scan(step, carry, keys)[0]
+
+    start = jax.vmap(env.reset)(jax.random.split(key_start, num_lanes), lanes)
+    unfinished = lambda carry: carry[2] < config.num_critic_transitions  # noqa: E731
+    return jax.lax.while_loop(unfinished, burst, (start, store, jnp.int32(0)))[1]
+
+
+def disturb(config: Config, env: Env, action: jax.Array, key: jax.Array) -> jax.Array:
+    """Add noise of deviation `critic_noise` to actions f32[L, A]; choose at random that often where they are discrete."""
+    if not env.spec.discrete:
+        return jnp.clip(action + config.critic_noise * jax.random.normal(key, action.shape), -1.0, 1.0)
+    key_whether, key_what = jax.random.split(key)
+    other = jax.nn.one_hot(jax.random.randint(key_what, action.shape[:1], 0, action.shape[1]), action.shape[1])
+    return tree.where(jax.random.uniform(key_whether, action.shape[:1]) < config.critic_noise, other, action)
+
+
+def pretrain(
+    config: Config, env: Env, key: jax.Array
+) -> tuple[imitation.LearnerState, imitation.HumanData, dict[str, critic.CriticState]]:
+    """Return the policy, data and critics that the fleet starts with.
+
+    The safety critic learns from the first clone's transitions, the goal critic from the supervisor's; both after
+    the policy, whose actions their targets use.
+
+    Reference: paper, Section 5.2 and Appendix (training critic Q-functions).
+    """
+    key_demos, key_init, key_policy, key_critics = jax.random.split(key, 4)
+    algorithm = priority.get_algorithm(config.algorithm)
+    supervisor = supervisors.make(config.supervisor or env.spec.supervisor, env)
+    learner = imitation.make_learner(config, env.spec)
+    members = 1 if env.spec.discrete else config.ensemble_size
+
+    data = imitation.create_data(env.spec, ensemble_size=members, capacity=config.human_capacity)
+    if algorithm.pretrains:
+        data = collect_demonstrations(config, env, supervisor, data, key_demos)
+    normalizer = fit_normalizer(data.pairs.rows.obs, data.pairs.size, enabled=config.normalize_observations)
+    policy = learner.init(key_init, normalizer)
+    if algorithm.pretrains:
+        keys = lambda i: jax.random.fold_in(key_policy, i)  # noqa: E731
+        policy = jax.lax.fori_loop(0, config.pretraining_steps, lambda i, p: learner.update(p, data, keys(i))[0], policy)
+
+    states = {}
+    for kind in algorithm.critics:
+        key_critics, key_net, key_data, key_train = jax.random.split(key_critics, 4)
+        parts = critic.make_critic(kind, config, env.spec, learner)
+
+        def act(state: EnvState, key: jax.Array, kind: str = kind) -> jax.Array:
+            if kind == "safety":
+                return learner.act(policy, state.obs)
+            return jax.vmap(supervisor.act)(state, jax.random.split(key, state.obs.shape[0]))
+
+        full = collect_transitions(config, env, act, parts.append, parts.init(key_net), key_data)
+        steps = config.critic_pretraining_steps
+        states[kind] = _train_critic(parts, full, policy, steps, key_train)
+    return policy, data, states
+
+
+def _train_critic(parts: critic.Critic, state: critic.CriticState, policy, steps: jax.Array, key: jax.Array):
+    """Take gradient steps; the rings stay out of the loop's carry, which a sweep would copy at each turn."""
+    rings = {"positives": state.positives, "negatives": state.negatives}
+
+    def body(i, nets):
+        params, target, opt_state = nets
+        before = critic.CriticState(params, target, opt_state, **rings)
+        after = parts.update(before, policy, jax.random.fold_in(key, i))
+        return after.params, after.target, after.opt_state
+
+    nets = jax.lax.fori_loop(0, steps, body, (state.params, state.target, state.opt_state))
+    return critic.CriticState(*nets, **rings)

@@ -14,37 +14,40 @@ import functools
 import json
 import time
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import Env as BraxEnv
 from brax.envs.base import State
-from brax.training import types
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks, train
 from flax import linen, serialization
 
-from fleetjax import envs
+from fleetjax.envs import Env, humanoid
 from fleetjax.supervisors import expert
 
 PACKAGE_WEIGHTS = Path(expert.__file__).parent / "weights"
 
+# Environments by name: how to make one, and the return below which no episode succeeds.
+TASKS = {"humanoid": (humanoid.make_env, humanoid.SUCCESS_FLOOR)}
+
 # Hyper-parameters of each task; the rest are brax's defaults.
-SETTINGS = {
-    "humanoid": dict(
-        num_envs=1024,
-        unroll_length=16,
-        batch_size=64,
-        num_minibatches=32,
-        num_updates_per_batch=4,
-        learning_rate=3e-4,
-        clipping_epsilon=0.3,
-        entropy_cost=1e-3,
-        discounting=0.97,
-        reward_scaling=0.1,
-        max_grad_norm=1.0,
-    ),
+SETTINGS: dict[str, dict[str, Any]] = {
+    "humanoid": {
+        "num_envs": 1024,
+        "unroll_length": 16,
+        "batch_size": 64,
+        "num_minibatches": 32,
+        "num_updates_per_batch": 4,
+        "learning_rate": 3e-4,
+        "clipping_epsilon": 0.3,
+        "entropy_cost": 1e-3,
+        "discounting": 0.97,
+        "reward_scaling": 0.1,
+        "max_grad_norm": 1.0,
+    },
 }
 make_networks = functools.partial(
     networks.make_ppo_networks,
@@ -65,15 +68,15 @@ if not hasattr(jax, "device_put_replicated"):  # brax 0.14.2 calls it; jax 0.10 
 class Task(BraxEnv):
     """A fleetjax environment as brax sees it; brax's own wrappers reset it and cut its episodes."""
 
-    def __init__(self, env: envs.Env):
+    def __init__(self, env: Env):
         self.env = env
 
     def reset(self, rng: jax.Array) -> State:
         """Start an episode."""
-        state = self.env.reset(rng, jnp.int32(0))
+        state: Any = self.env.reset(rng, jnp.int32(0))  # brax expects its own kind of state, and looks at none of it
         return State(state, state.obs, state.reward, jnp.float32(0), {}, {"key": rng})
 
-    def step(self, state: State, action: jax.Array) -> State:
+    def step(self, state: Any, action: jax.Array) -> State:
         """Take one control step; a violation ends the episode."""
         key_next, key_step = jax.random.split(state.info["key"])
         after = self.env.step(state.pipeline_state, action, jnp.bool_(True), key_step)
@@ -99,7 +102,7 @@ class Task(BraxEnv):
 
 def template(task: Task):
     """Return parameters of the right structure, to read a checkpoint into."""
-    nets = make_networks(task.observation_size, task.action_size, types.identity_observation_preprocessor)
+    nets = make_networks(task.observation_size, task.action_size)
     key = jax.random.key(0)
     statistics = running_statistics.init_state(specs.Array((task.observation_size,), jnp.dtype("float32")))
     return statistics, nets.policy_network.init(key), nets.value_network.init(key)
@@ -115,7 +118,7 @@ def train_expert(
 ) -> None:
     """Train until `num_timesteps` in all, from the last checkpoint if there is one."""
     folder.mkdir(parents=True, exist_ok=True)
-    task = Task(envs.make_env(name, success_return=float("inf")))
+    task = Task(TASKS[name][0](success_return=float("inf")))
     done, restore = 0, None
     if checkpoints(folder):
         last = checkpoints(folder)[-1]
@@ -188,7 +191,7 @@ def ship(name: str, folder: Path, *, candidates: int, num_episodes: int) -> None
     """
     with (folder / "curve.csv").open() as file:
         curve = {int(row["steps"]): float(row["episode_return"]) for row in csv.DictReader(file)}
-    task = Task(envs.make_env(name, success_return=float("inf")))
+    task = Task(TASKS[name][0](success_return=float("inf")))
     ranked = sorted(checkpoints(folder), key=lambda path: -curve.get(int(path.stem.split("_")[1]), -np.inf))
     best = None
     for path in ranked[:candidates]:
@@ -203,9 +206,7 @@ def ship(name: str, folder: Path, *, candidates: int, num_episodes: int) -> None
             "mean_return": round(float(returns.mean()), 1),
             "mean_return_full_length": round(mean, 1),
             "share_full_length": round(float(full.mean()), 4),
-            "share_successful": round(
-                float((full & (returns > max(envs.SUCCESS_FLOOR.get(name, -np.inf), 0.95 * mean))).mean()), 4
-            ),
+            "share_successful": round(float((full & (returns > max(TASKS[name][1], 0.95 * mean))).mean()), 4),
         }
         print(record, flush=True)
         if best is None or record["share_successful"] > best[0]["share_successful"]:

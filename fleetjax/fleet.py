@@ -174,7 +174,7 @@ def make_fleet(config: Config, env: Env) -> Fleet:
 def _restart_clocks(
     humans: HumanState, was_resetting: jax.Array, resetting: jax.Array, hard_reset_time: jax.Array
 ) -> HumanState:
-    """Return `humans` with duration 0 where the kind of intervention changes, or a completed hard reset is followed by another."""
+    """Return `humans` with duration 0 where the kind of intervention changed, or the last hard reset is completed."""
     changed = was_resetting[humans.robot] != resetting[humans.robot]
     completed = was_resetting[humans.robot] & (humans.duration >= hard_reset_time)
     return humans._replace(duration=jnp.where(changed | completed, 0, humans.duration))

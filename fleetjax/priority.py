@@ -111,9 +111,9 @@ def ensemble_dagger(config) -> Priority:
 
 
 class Moments(NamedTuple):
-    """Running moments of two quantities: count f32[], mean f32[2], sum of squared deviations f32[2]."""
+    """Running moments of two quantities: number f32[], mean f32[2], sum of squared deviations f32[2]."""
 
-    count: jax.Array
+    number: jax.Array
     mean: jax.Array
     squares: jax.Array
 
@@ -121,11 +121,11 @@ class Moments(NamedTuple):
 def update_moments(moments: Moments, values: jax.Array) -> Moments:
     """Return the moments with `values` f32[N, 2] added (Chan's parallel formula)."""
     added = jnp.float32(values.shape[0])
-    count = moments.count + added
+    number = moments.number + added
     mean = jnp.mean(values, axis=0)
     shift = mean - moments.mean
-    squares = moments.squares + jnp.sum((values - mean) ** 2, axis=0) + shift**2 * moments.count * added / count
-    return Moments(count, moments.mean + shift * added / count, squares)
+    squares = moments.squares + jnp.sum((values - mean) ** 2, axis=0) + shift**2 * moments.number * added / number
+    return Moments(number, moments.mean + shift * added / number, squares)
 
 
 def thrifty_dagger(config) -> Priority:
@@ -143,7 +143,7 @@ def thrifty_dagger(config) -> Priority:
         del key
         values = jnp.stack([signals.uncertainty, 1.0 - signals.goal], axis=1)
         moments = update_moments(moments, values)
-        deviation = jnp.sqrt(moments.squares / moments.count)
+        deviation = jnp.sqrt(moments.squares / moments.number)
         z = (values - moments.mean) / jnp.maximum(deviation, 1e-8)
         combined = (1 - config.thrifty_weight) * z[:, 0] + config.thrifty_weight * z[:, 1]
         excess = jnp.maximum(combined - config.thrifty_threshold, 0.0)

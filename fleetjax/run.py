@@ -84,16 +84,15 @@ def run(config: Config, key: jax.Array, state: FleetState | None = None, env: en
     """
     validate(config, env)
     env = env or envs.make(config.environment, config.backend)
-    if state is None:
-        state = prepare(config, key, env)
+    start = prepare(config, key, env) if state is None else state
     fleet = make_fleet(config, env)
     _, key_steps = jax.random.split(key)
 
     def timestep(state: FleetState, _: None) -> tuple[FleetState, Metrics]:
         return fleet.step(state, jax.random.fold_in(key_steps, state.timestep))
 
-    state, metrics = jax.lax.scan(timestep, state, length=config.num_steps)
-    return Result(metrics, state)
+    last, metrics = jax.lax.scan(timestep, start, length=config.num_steps)
+    return Result(metrics, last)
 
 
 def evaluate(config: Config, key: jax.Array, learner: LearnerState, env: envs.Env | None = None) -> Result:

@@ -1,6 +1,6 @@
 """The contract that every environment meets, and the registry of environments."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -21,7 +21,6 @@ class EnvSpec(NamedTuple):
         discrete: whether actions are choices rather than vectors in [-1, 1].
         has_goal: whether `success` means that a goal was reached, so that a goal critic can learn from it.
         supervisor: registered name of the supervisor that helps by default.
-        defaults: `Config` fields whose default this environment changes.
     """
 
     name: str
@@ -32,7 +31,6 @@ class EnvSpec(NamedTuple):
     discrete: bool = False
     has_goal: bool = False
     supervisor: str = ""
-    defaults: Mapping[str, Any] = {}
 
 
 class Env(NamedTuple):

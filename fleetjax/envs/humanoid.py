@@ -17,7 +17,7 @@ HORIZON = 999
 FALL_HEIGHT = 0.8  # m, of the torso
 TARGET = (1000.0, 0.0)  # m, in the ground plane
 SUBSTEPS = 3
-DEFAULTS = {"uncertainty_threshold": 0.05, "initial_period": 1000}
+SUCCESS_FLOOR = 6000.0  # episode return
 
 
 def make_env(*, backend: str = "auto", success_return: float | None = None) -> base.Env:
@@ -31,11 +31,9 @@ def make_env(*, backend: str = "auto", success_return: float | None = None) -> b
     if success_return is None:
         from fleetjax.supervisors import expert
 
-        success_return = max(6000.0, 0.95 * expert.mean_return("humanoid"))
+        success_return = max(SUCCESS_FLOOR, 0.95 * expert.mean_return("humanoid"))
     physics = make_physics("humanoid.xml", substeps=SUBSTEPS, backend=backend)
-    spec = base.EnvSpec(
-        "humanoid", 108, physics.model.nu, HORIZON, physics.control_step, supervisor="humanoid", defaults=DEFAULTS
-    )
+    spec = base.EnvSpec("humanoid", 108, physics.model.nu, HORIZON, physics.control_step, supervisor="humanoid")
     joints = _Joints(physics.model)
 
     def reset(key: jax.Array, robot: jax.Array) -> EnvState:

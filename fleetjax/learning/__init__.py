@@ -1,0 +1,1 @@
+"""How robots learn: the policy ensemble, critics, data, pre-training."""

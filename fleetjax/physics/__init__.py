@@ -1,0 +1,1 @@
+"""Rigid-body physics of robots: one contract, several backends."""

@@ -28,7 +28,7 @@ def record(name: str) -> dict:
 
 def mean_return(name: str) -> float:
     """Return the expert's mean undiscounted return over episodes of full length."""
-    return float(record(name)["mean_return_full_length"])
+    return float(record(name)["mean_return_full_length"] or 0)
 
 
 @functools.cache

@@ -154,6 +154,9 @@ def train_expert(
         )
 
     remaining = num_timesteps - done
+    settings = dict(SETTINGS[name])
+    if learning_rate is not None:
+        settings["learning_rate"] = learning_rate
     train.train(
         environment=task,
         num_timesteps=remaining,
@@ -167,7 +170,7 @@ def train_expert(
         progress_fn=log,
         policy_params_fn=save,
         restore_params=restore,
-        **SETTINGS[name] | ({} if learning_rate is None else {"learning_rate": learning_rate}),
+        **settings,
     )
 
 

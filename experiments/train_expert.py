@@ -216,7 +216,7 @@ def ship(name: str, folder: Path, *, candidates: int, num_episodes: int) -> None
             best = (record, weights)
     assert best is not None, f"no checkpoint in {folder}"
     PACKAGE_WEIGHTS.mkdir(exist_ok=True)
-    np.savez_compressed(PACKAGE_WEIGHTS / f"{name}.npz", **best[1])
+    np.savez_compressed(PACKAGE_WEIGHTS / f"{name}.npz", **best[1])  # pyright: ignore[reportArgumentType]
     (PACKAGE_WEIGHTS / f"{name}.json").write_text(json.dumps(best[0], indent=2) + "\n")
     (PACKAGE_WEIGHTS / f"{name}_curve.csv").write_text((folder / "curve.csv").read_text())
     print(f"shipped {best[0]}")

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from fleetjax import envs, priority, supervisors
 from fleetjax.physics.base import BACKENDS
@@ -130,7 +131,7 @@ def _typed(name: str, value: Any) -> Any:
 
 
 def _is_concrete(value: Any) -> bool:
-    return not isinstance(value, jax.core.Tracer)
+    return not isinstance(value, Tracer)
 
 
 def needed_human_capacity(config: Config) -> int:
@@ -165,7 +166,7 @@ def make_config(environment: "str | envs.Env", algorithm: str = "cur", **overrid
     else:
         name, defaults = environment, envs.get_defaults(environment)
     priority.get_algorithm(algorithm)
-    fields = {f.name: f.default for f in dataclasses.fields(Config)} | dict(defaults)
+    fields: dict[str, Any] = {f.name: f.default for f in dataclasses.fields(Config)} | dict(defaults)
     fields |= {"environment": name, "algorithm": algorithm} | overrides
     if algorithm == "expert" and "num_humans" not in overrides:
         fields["num_humans"] = fields["num_robots"]

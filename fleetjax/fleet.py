@@ -172,7 +172,7 @@ def make_fleet(config: Config, env: Env) -> Fleet:
 
 
 def _restart_clocks(
-    humans: HumanState, was_resetting: jax.Array, resetting: jax.Array, hard_reset_time: jax.Array
+    humans: HumanState, was_resetting: jax.Array, resetting: jax.Array, hard_reset_time: jax.Array | int
 ) -> HumanState:
     """Return `humans` with duration 0 where the kind of intervention changed, or the last hard reset is completed."""
     changed = was_resetting[humans.robot] != resetting[humans.robot]

@@ -92,5 +92,8 @@ def proceed(
     episode_step = state.episode_step + 1
     timeout = (episode_step >= horizon) & ~violation
     if success is None:
-        success = timeout & (episode_return > jnp.float32(jnp.inf if success_return is None else success_return))
-    return EnvState(physics, obs, reward, violation, success & ~violation, timeout, episode_return, episode_step)
+        needed = jnp.inf if success_return is None else success_return
+        succeeded = timeout & (episode_return > jnp.float32(needed))
+    else:
+        succeeded = success & ~violation
+    return EnvState(physics, obs, reward, violation, succeeded, timeout, episode_return, episode_step)

@@ -29,7 +29,7 @@ class Buffer(NamedTuple):
 
 
 def create(example: Any, capacity: int) -> Buffer:
-    """Return an empty buffer for rows like `example`, a pytree of unbatched arrays or shape structs."""
+    """Return an empty buffer for rows like `example`, a pytree of unbatched arrays."""
     rows = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), example)
     return Buffer(rows, jnp.zeros((), jnp.int32))
 

@@ -13,7 +13,7 @@ from fleetjax.config import Config
 from fleetjax.envs import EnvSpec
 from fleetjax.learning import buffer
 from fleetjax.learning.imitation import Learner, LearnerState
-from fleetjax.learning.networks import MLP, Normalizer
+from fleetjax.learning.networks import Normalizer, make_mlp
 from fleetjax.tree import take, where
 
 TWINS = 2
@@ -75,15 +75,14 @@ def make_critic(kind: str, config: Config, spec: EnvSpec, learner: Learner) -> C
     safety = kind == "safety"
     discount = config.risk_discount if safety else config.goal_discount
     pessimistic = jnp.max if safety else jnp.min
-    network = MLP(config.hidden_sizes, 1)
+    network = make_mlp(config.hidden_sizes, 1)
     optimizer = optax.scale_by_adam()
 
     def init(key: jax.Array) -> CriticState:
         inputs = jnp.zeros(spec.observation_size + spec.action_size)
         params = jax.vmap(lambda k: network.init(k, inputs))(jax.random.split(key, TWINS))
-        flag = jax.ShapeDtypeStruct((), jnp.bool_)
-        obs = jax.ShapeDtypeStruct((spec.observation_size,), jnp.float32)
-        example = Transition(obs, jax.ShapeDtypeStruct((spec.action_size,), jnp.float32), obs, flag, flag)
+        flag, obs = jnp.zeros((), bool), jnp.zeros(spec.observation_size)
+        example = Transition(obs, jnp.zeros(spec.action_size), obs, flag, flag)
         few = max(config.num_robots, config.critic_capacity // 10)
         return CriticState(
             params=params,

@@ -13,7 +13,7 @@ import optax
 from fleetjax.config import Config
 from fleetjax.envs import EnvSpec
 from fleetjax.learning import buffer
-from fleetjax.learning.networks import MLP, Normalizer
+from fleetjax.learning.networks import Normalizer, make_mlp
 from fleetjax.tree import take
 
 
@@ -62,9 +62,7 @@ class Learner(NamedTuple):
 
 def create_data(spec: EnvSpec, *, ensemble_size: int, capacity: int) -> HumanData:
     """Return an empty data set."""
-    example = Pair(
-        jax.ShapeDtypeStruct((spec.observation_size,), jnp.float32), jax.ShapeDtypeStruct((spec.action_size,), jnp.float32)
-    )
+    example = Pair(jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size))
     return HumanData(buffer.create(example, capacity), jnp.zeros((ensemble_size, capacity), jnp.int32))
 
 
@@ -83,7 +81,7 @@ def append(data: HumanData, pairs: Pair, mask: jax.Array, key: jax.Array) -> Hum
 def make_learner(config: Config, spec: EnvSpec) -> Learner:
     """Build the ensemble for a configuration and an environment."""
     members = 1 if spec.discrete else config.ensemble_size
-    network = MLP(config.hidden_sizes, spec.action_size)
+    network = make_mlp(config.hidden_sizes, spec.action_size)
     optimizer = optax.scale_by_adam()
 
     def init(key: jax.Array, normalizer: Normalizer) -> LearnerState:

@@ -1,25 +1,27 @@
 """The networks of policy and critics, and how they see observations."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
 
-class MLP(nn.Module):
-    """Dense layers with ReLU between them; the last is linear."""
+class Network(NamedTuple):
+    """Pure functions of a network: `init(key, example) -> params`, `apply(params, x f32[..., I]) -> f32[..., O]`."""
 
-    hidden_sizes: Sequence[int]
-    output_size: int
+    init: Callable[[jax.Array, jax.Array], Any]
+    apply: Callable[[Any, jax.Array], jax.Array]
 
-    @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
-        """Map f32[..., I] to f32[..., output_size]."""
-        for size in self.hidden_sizes:
-            x = nn.relu(nn.Dense(size)(x))
-        return nn.Dense(self.output_size)(x)
+
+def make_mlp(hidden_sizes: Sequence[int], output_size: int) -> Network:
+    """Return dense layers with ReLU between them; the last is linear."""
+    layers = []
+    for size in hidden_sizes:
+        layers += [nn.Dense(size), nn.relu]
+    module = nn.Sequential([*layers, nn.Dense(output_size)])
+    return Network(module.init, lambda params, x: jnp.asarray(module.apply(params, x)))
 
 
 class Normalizer(NamedTuple):
@@ -33,7 +35,7 @@ class Normalizer(NamedTuple):
         return jnp.clip((obs - self.mean) / self.deviation, -10.0, 10.0)
 
 
-def fit_normalizer(obs: jax.Array, size: jax.Array, *, enabled: jax.Array) -> Normalizer:
+def fit_normalizer(obs: jax.Array, size: jax.Array, *, enabled: jax.Array | bool) -> Normalizer:
     """Return the statistics of the first `size` rows of `obs` f32[K, O], or the identity if not `enabled`.
 
     Entries that never vary keep their scale.

@@ -134,7 +134,7 @@ def pretrain(
     return policy, data, states
 
 
-def _train_critic(parts: critic.Critic, state: critic.CriticState, policy, steps: jax.Array, key: jax.Array):
+def _train_critic(parts: critic.Critic, state: critic.CriticState, policy, steps: jax.Array | int, key: jax.Array):
     """Take gradient steps; the rings stay out of the loop's carry, which a sweep would copy at each turn."""
     rings = {"positives": state.positives, "negatives": state.negatives}
 

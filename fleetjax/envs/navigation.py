@@ -16,7 +16,7 @@ HORIZON = 250
 CONTROL_STEP = 0.1  # s
 TOP_SPEED = 0.5  # m/s, reached when the full action is held
 INERTIA = 0.8  # share of the velocity that one control step keeps
-NOISE = 0.06  # m/s, deviation of the push in one control step
+NOISE = 0.05  # m/s, deviation of the push in one control step
 GOAL_RADIUS = 0.08  # m
 WALLS_X = np.array([-1 / 3, 1 / 3], np.float32)  # m, where the walls stand
 DOORS_Y = np.array([0.5, -0.5], np.float32)  # m, centres of their doorways
@@ -94,7 +94,7 @@ def teach(state: EnvState) -> jax.Array:
     target = jnp.where((side == 0) & jnp.any(in_doorway), _clear_of_doorway(position, target, in_doorway), target)
     wanted = 4.0 * (target - position)
     wanted /= jnp.maximum(jnp.linalg.norm(wanted) / (0.8 * TOP_SPEED), 1.0)
-    return jnp.clip((wanted - INERTIA * velocity) / ((1 - INERTIA) * TOP_SPEED), -1.0, 1.0)
+    return jnp.clip((2 * wanted - velocity) / TOP_SPEED, -1.0, 1.0)
 
 
 def _clear_of_doorway(position: jax.Array, target: jax.Array, in_doorway: jax.Array) -> jax.Array:

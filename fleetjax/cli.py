@@ -1,0 +1,182 @@
+"""The command line: `fleetjax run`, `list`, `plot` and `evaluate`.
+
+What cannot be used is refused with one line on stderr and exit code 2, before anything is computed.
+"""
+
+import argparse
+import contextlib
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import jax
+
+from fleetjax import envs
+from fleetjax.config import FIELDS, Config, make_config, validate
+from fleetjax.envs import get_defaults, list_envs
+from fleetjax.io import execution, flags, folder, text
+from fleetjax.io.flags import Refusal
+from fleetjax.io.progress import progress, say
+from fleetjax.metrics import Metrics
+from fleetjax.priority import get_algorithm, list_algorithms
+
+INTERRUPTED = 130  # what shells report for a process that SIGINT ended
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: arguments; None takes the process's, which Ctrl-C then ends at once.
+
+    Returns:
+        int: exit code: 0, 2 for input that cannot be used, 130 after Ctrl-C.
+    """
+    commands = {"run": _run, "list": _list, "plot": _plot, "evaluate": _evaluate}
+    try:
+        arguments = flags.parse(sys.argv[1:] if argv is None else argv)
+        commands[arguments.command](arguments)
+    except Refusal as error:
+        say(f"fleetjax: {_one_line(error)}")
+        return 2
+    except OSError as error:
+        say(f"fleetjax: {_one_line(error)}")
+        return 2
+    except KeyboardInterrupt as interrupt:
+        say(f"fleetjax: interrupted{_one_line(interrupt)}")
+        if argv is None:  # a computation that still runs would hold the process until it ends
+            sys.stdout.flush()
+            os._exit(INTERRUPTED)
+        return INTERRUPTED
+    return 0
+
+
+def _one_line(error: BaseException) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    return " ".join(str(error).split())
+
+
+@contextlib.contextmanager
+def _refusing() -> Iterator[None]:
+    """Turn the ValueErrors of validation, and of reading files, into refusals."""
+    try:
+        yield
+    except ValueError as error:
+        raise Refusal(str(error)) from error
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    overrides = {name: value for name, value in vars(arguments).items() if name in FIELDS}
+    seed = arguments.seed
+    with _refusing():
+        config = make_config(overrides.pop("environment"), overrides.pop("algorithm", "cur"), **overrides)
+    path = arguments.output or folder.default_folder(config, seed)
+    folder.create(path, config, seed, overwrite=arguments.overwrite)
+    begun = time.monotonic()
+    chunks: list[Metrics] = []
+    try:
+        state = _operate(config, seed, chunks)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(_keep(path, config, seed, chunks)) from None
+    metrics = execution.join(chunks)
+    if get_algorithm(config.algorithm).pretrains:
+        folder.write_policy(path, state.learner)
+    _save(path, config, seed, metrics)
+    print(f"\n{text.headline(config, seed)}\n\n{text.run_table(metrics, config)}\n")
+    print(f"{text.duration(time.monotonic() - begun)} in all. Run folder: {path}")
+
+
+def _operate(config: Config, seed: int, chunks: list[Metrics]):
+    """Pre-train and run, with progress; the metrics go to `chunks` as they come. Return the last state."""
+    begun, key = time.monotonic(), jax.random.key(seed)
+    first = "pre-training" if get_algorithm(config.algorithm).pretrains else "preparing"
+    say(f"{text.headline(config, seed)}, on the {jax.default_backend().upper()}: compiling and {first} ...")
+    state = execution.start(config, key)
+    say(f"ready after {text.duration(time.monotonic() - begun)}")
+    with progress(config) as show:
+        for metrics, after in execution.go_on(config, key, state, execution.chunks_of(config.num_steps)):
+            chunks.append(metrics)
+            show(metrics)
+            state = after
+    return state
+
+
+def _keep(path: Path, config: Config, seed: int, chunks: list[Metrics]) -> str:
+    """Save what an interrupted run has; return what there is to say about it."""
+    if not chunks:
+        folder.discard(path)
+        return " before the first timestep; nothing was kept"
+    metrics = execution.join(chunks)
+    _save(path, config, seed, metrics)
+    return f" after {len(metrics.successes)} of {config.num_steps} timesteps; their metrics and figure are in {path}"
+
+
+def _save(path: Path, config: Config, seed: int, metrics: Metrics) -> None:
+    from fleetjax.io import figure  # matplotlib takes a while to import
+
+    folder.write_metrics(path, metrics)
+    drawn = figure.draw(figure.group([(config, seed, metrics)]), text.headline(config, seed))
+    folder.write(path / folder.FIGURE, figure.render(drawn))
+    folder.write_config(path, config, seed)
+
+
+def _list(arguments: argparse.Namespace) -> None:
+    del arguments
+    print("environments")
+    rows: list[tuple[str, ...]] = [("", "name", "observations", "actions", "horizon", "control step", "goals")]
+    for name in list_envs():
+        spec = envs.make(name).spec
+        sizes = map(str, (spec.observation_size, spec.action_size, spec.horizon))
+        rows.append(("", name, *sizes, f"{1000 * spec.control_step:.1f} ms", "yes" if spec.has_goal else "no"))
+    print(text.table(rows, right=[2, 3, 4, 5]))
+    for name in list_envs():
+        changed = {field: value for field, value in get_defaults(name).items() if value != getattr(Config, field)}
+        print(f"  {name}'s own defaults: {', '.join(f'{field} {flags.show(value)}' for field, value in changed.items())}")
+    print("\nalgorithms")
+    named = [name for name in list_algorithms() if not text.is_order(name) or name == "cur"]
+    print(text.table([("", name, text.label(name), text.meaning(name)) for name in named]))
+    orders = [name for name in list_algorithms() if text.is_order(name) and name != "cur"]
+    print(f"  and {', '.join(orders)}: {text.LETTERS}")
+
+
+def _plot(arguments: argparse.Namespace) -> None:
+    from fleetjax.io import figure
+
+    with _refusing():
+        figure.check_format(arguments.output)
+        runs = [folder.read_run(path) for path in arguments.runs]
+        data = [(run.config, run.seed, folder.read_metrics(run)) for run in runs]
+    folder.check_free(arguments.output, overwrite=arguments.overwrite)
+    drawn = figure.draw(figure.group(data))
+    folder.write(arguments.output, figure.render(drawn, arguments.output.suffix))
+    print(arguments.output)
+
+
+def _evaluate(arguments: argparse.Namespace) -> None:
+    with _refusing():
+        run = folder.read_run(arguments.run)
+        config = run.config.replace(num_steps=arguments.num_steps)
+        validate(config)
+        if not get_algorithm(config.algorithm).pretrains:
+            raise ValueError(f"algorithm = {config.algorithm!r} trains no policy that could be evaluated")
+        learner = folder.read_policy(run)
+    output = run.folder / folder.EVALUATION
+    folder.check_free(output, overwrite=arguments.overwrite)
+    seed = (run.seed + 1) % 2**32 if arguments.seed is None else arguments.seed
+    chunks: list[Metrics] = []
+    say(f"{text.headline(config, seed)}, nobody teleoperates: compiling ...")
+    with progress(config, with_rohe=False) as show:
+        for metrics in execution.evaluate_in_chunks(config, jax.random.key(seed), learner):
+            chunks.append(metrics)
+            show(metrics)
+    metrics = execution.join(chunks)
+    total = {name: value for name, value in text.add_up(metrics).items() if name in _EVALUATED}
+    content = {"num_steps": config.num_steps, "seed": seed, "totals": total, "versions": folder.versions()}
+    folder.write_json(output, content)
+    print(text.evaluation_table(metrics, config))
+
+
+_EVALUATED = ("successes", "violations", "hard_resets", "idle", "human_steps", "moving", "reward")

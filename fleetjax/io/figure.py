@@ -1,0 +1,175 @@
+"""The paper's four curves: cumulative successes, hard resets and idle time, and the return on human effort."""
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+from fleetjax.config import Config
+from fleetjax.io import text
+from fleetjax.io.folder import to_plain
+from fleetjax.metrics import Metrics, rohe
+
+PANELS = ("Cumulative successes", "Cumulative hard resets", "Cumulative idle time", "Return on human effort")
+FORMATS = (".png", ".pdf", ".svg")
+# Okabe and Ito's palette: told apart with every common kind of colour vision. One colour for an algorithm, always.
+_COLOURS = {
+    "cur": "#0072B2",
+    "constraint": "#000000",
+    "random": "#E69F00",
+    "ensemble_dagger": "#009E73",
+    "thrifty_dagger": "#D55E00",
+    "expert": "#7F7F7F",
+}
+_OTHERS = ("#CC79A7", "#56B4E9", "#F0E442", *_COLOURS.values())
+_DASHES = ("-", (0, (5, 1.5)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)))
+_STYLE: dict[Any, Any] = {
+    "font.size": 9,
+    "axes.titlesize": 10,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#555555",
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#E4E4E4",
+    "grid.linewidth": 0.7,
+    "xtick.color": "#555555",
+    "ytick.color": "#555555",
+    "legend.frameon": False,
+    "svg.fonttype": "none",
+}
+
+
+class Curves(NamedTuple):
+    """What is drawn as one line.
+
+    Attributes:
+        label: its name in the legend.
+        algorithm: gives the colour.
+        values: f64[S, 4, T] the panels' curves, for each seed.
+    """
+
+    label: str
+    algorithm: str
+    values: np.ndarray
+
+
+def curves_of(metrics: Metrics, config: Config) -> np.ndarray:
+    """Return f64[4, T], the curves of one run in the order of `PANELS`."""
+    counts = np.array([metrics.successes, metrics.violations, metrics.idle], np.float64)
+    return np.vstack([np.cumsum(counts, axis=1), np.asarray(rohe(metrics, config))])
+
+
+def group(runs: Sequence[tuple[Config, int, Metrics]]) -> list[Curves]:
+    """Gather runs that differ in nothing but their seed. Labels tell what else differs.
+
+    Args:
+        runs: configuration, seed and Metrics[T] of each; a seed that comes twice counts once, the later run.
+
+    Returns:
+        Curves for each setting, in order of appearance, cut at the shortest of its runs.
+    """
+    groups: dict[str, dict[int, Metrics]] = {}
+    configs: dict[str, Config] = {}
+    for config, seed, metrics in runs:
+        key = repr(to_plain(config))
+        configs[key] = config
+        groups.setdefault(key, {})[seed] = metrics
+    labels = _labels([to_plain(config) for config in configs.values()])
+    result = []
+    for (key, seeds), name in zip(groups.items(), labels, strict=True):
+        length = min(len(metrics.successes) for metrics in seeds.values())
+        values = np.stack([curves_of(metrics, configs[key])[:, :length] for metrics in seeds.values()])
+        result.append(Curves(name, configs[key].algorithm, values))
+    return result
+
+
+def _labels(settings: Sequence[dict[str, Any]]) -> list[str]:
+    """Return a name for each setting: the algorithm, and the fields in which settings of that algorithm differ."""
+    names = []
+    for fields in settings:
+        alike = [other for other in settings if other["algorithm"] == fields["algorithm"]]
+        differing = [name for name in fields if any(other[name] != fields[name] for other in alike)]
+        if len({other["environment"] for other in settings}) > 1:
+            differing = ["environment"]  # whose defaults differ in more than can be read
+        extra = [fields[name] if name == "environment" else f"{name} {fields[name]}" for name in differing]
+        names.append(", ".join([text.label(fields["algorithm"]), *extra]))
+    return names
+
+
+def draw(groups: Sequence[Curves], title: str = "") -> Figure:
+    """Draw each group in every panel: the mean over its seeds, and a band of one standard deviation."""
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(12.5, 3.4), layout="constrained")
+        axes = figure.subplots(1, len(PANELS))
+        styles = _styles([curves.algorithm for curves in groups])
+        for panel, (ax, name) in enumerate(zip(axes, PANELS, strict=True)):
+            _prepare_axes(ax, name)
+            for curves, (colour, dashes) in zip(groups, styles, strict=True):
+                seeds = curves.values[:, panel]
+                t, mean = np.arange(1, seeds.shape[1] + 1), seeds.mean(axis=0)
+                ax.plot(t, mean, color=colour, linestyle=dashes, linewidth=1.8, label=_legend(curves))
+                if len(seeds) > 1:
+                    deviation = seeds.std(axis=0, ddof=1)
+                    ax.fill_between(t, mean - deviation, mean + deviation, color=colour, alpha=0.2, linewidth=0)
+            ax.set_xlim(0, max(curves.values.shape[2] for curves in groups))
+            ax.set_ylim(bottom=0)
+        handles, labels = axes[0].get_legend_handles_labels()
+        columns = min(len(labels), 4)
+        figure.legend(handles, labels, loc="outside upper left", ncols=columns, title=title or None, alignment="left")
+    return figure
+
+
+def _legend(curves: Curves) -> str:
+    seeds = len(curves.values)
+    return f"{curves.label} ({seeds} seeds, ± 1 s.d.)" if seeds > 1 else curves.label
+
+
+def _prepare_axes(ax: Axes, name: str) -> None:
+    ax.set_title(name)
+    ax.set_xlabel("timesteps")
+    if name == PANELS[2]:
+        ax.set_ylabel("robot timesteps")
+    ax.xaxis.set_major_locator(MaxNLocator(4, integer=True))
+    ax.yaxis.set_major_locator(MaxNLocator(5))
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:,.0f}"))
+    if name != PANELS[3]:
+        ax.yaxis.set_major_locator(MaxNLocator(5, integer=True))
+        ax.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:,.0f}"))
+
+
+def _styles(algorithms: Sequence[str]) -> list[tuple[str, Any]]:
+    """Return colour and dashes of each line: an algorithm's own colour, dashes where it comes again."""
+    spare = iter(colour for colour in _OTHERS if colour not in {_COLOURS.get(a) for a in algorithms})
+    colours = dict(_COLOURS)
+    styles = []
+    for i, algorithm in enumerate(algorithms):
+        if algorithm not in colours:
+            colours[algorithm] = next(spare, _OTHERS[i % len(_OTHERS)])
+        styles.append((colours[algorithm], _DASHES[algorithms[:i].count(algorithm) % len(_DASHES)]))
+    return styles
+
+
+def render(figure: Figure, suffix: str = ".png") -> bytes:
+    """Return a figure as the content of a file of this kind."""
+    data = io.BytesIO()
+    with mpl.rc_context(_STYLE):
+        figure.savefig(data, format=suffix.removeprefix("."), dpi=160)
+    return data.getvalue()
+
+
+def check_format(path: Path) -> None:
+    """Check that a figure can be written to a file of this name.
+
+    Raises:
+        ValueError: if its ending is none that is known.
+    """
+    if path.suffix not in FORMATS:
+        raise ValueError(f"--output {path} must end in one of {', '.join(FORMATS)}")

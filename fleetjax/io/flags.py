@@ -1,0 +1,164 @@
+"""What can be typed: commands and flags, a flag for each field of `Config`."""
+
+import argparse
+import difflib
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from fleetjax.config import FIELDS, Config, Field
+from fleetjax.envs import get_defaults, list_envs
+from fleetjax.priority import unknown
+from fleetjax.version import VERSION
+
+_LARGEST_SEED = 2**32 - 1  # JAX folds larger ones onto these
+_LARGEST = 2**31 - 1
+_ABOUT = """\
+Interactive fleet learning: N robots, M humans. Who should get help, and what does the fleet gain?
+
+  fleetjax run navigation               a fleet that is done in a minute
+  fleetjax run humanoid                 the paper's main experiment, C.U.R. with 100 humanoids
+  fleetjax run humanoid --help          every parameter, with its meaning, unit and default
+  fleetjax plot runs/humanoid-*         runs in one figure, seeds as mean and band
+  fleetjax evaluate RUN                 the trained policy on its own, nobody teleoperates"""
+_RUN_ABOUT = """\
+Clone demonstrations, then run the fleet while it learns from those who help it. Ends with a table, and a run folder that
+holds config.json, metrics.csv (a row a timestep), figure.png and policy.msgpack."""
+_RUN_NOTE = """\
+Two algorithms have defaults of their own: expert has as many humans as robots; constraint has as many gradient steps before
+the start as others have in all, and the human time of C.U.R. as extra demonstrations. `fleetjax list` explains them."""
+
+
+class Refusal(Exception):
+    """Input that cannot be used; the message is for the user."""
+
+
+class _Parser(argparse.ArgumentParser):
+    """Refuses in one line, with the closest flag, where argparse would print its usage."""
+
+    def __init__(self, **options: Any):
+        super().__init__(allow_abbrev=False, formatter_class=_Format, **options)
+
+    def error(self, message: str) -> NoReturn:
+        raise Refusal(message)
+
+    def parse_known_args(self, args=None, namespace=None):  # pyright: ignore[reportIncompatibleMethodOverride]
+        namespace, extra = super().parse_known_args(args, namespace)
+        if extra:
+            self.error(self._stray(extra))
+        return namespace, extra
+
+    def _stray(self, extra: Sequence[str]) -> str:
+        flags = [word for word in extra if word.startswith("-")]
+        if not flags:
+            return f"unexpected argument {extra[0]!r}; {self.prog} --help tells what can be given"
+        flag = flags[0].split("=")[0]
+        close = difflib.get_close_matches(flag, list(self._option_string_actions), n=1, cutoff=0.0)
+        return f"unknown flag {flag}; the closest is {close[0]}"
+
+
+class _Format(argparse.RawDescriptionHelpFormatter):
+    def __init__(self, prog: str):
+        super().__init__(prog, max_help_position=30)
+
+
+def parse(argv: Sequence[str]) -> argparse.Namespace:
+    """Return the arguments; fields of `Config` are there only if they were given.
+
+    Raises:
+        Refusal: if they cannot be used.
+        SystemExit: with code 0, after help or version.
+    """
+    environment = next((word for word in argv[1:] if word in list_envs()), None)
+    parser, commands = make_parser(environment)
+    if argv and not argv[0].startswith("-") and argv[0] not in commands:
+        raise Refusal(unknown("command", argv[0], commands))
+    return parser.parse_args(argv or ["--help"])
+
+
+def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser, list[str]]:
+    """Return the parser and the names of the commands; defaults shown are those of `environment`, if given."""
+    parser = _Parser(prog="fleetjax", description=_ABOUT)
+    parser.add_argument("--version", action="version", version=f"fleetjax {VERSION}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands")
+    _add_run(commands, environment)
+    commands.add_parser("list", help="show environments and algorithms")
+
+    plot = commands.add_parser("plot", help="draw runs in one figure, seeds as mean and band")
+    plot.add_argument("runs", metavar="RUN", nargs="+", type=Path, help="run folder")
+    plot.add_argument(
+        "--output", metavar="FILE", type=Path, default=Path("fleetjax.png"), help="png, pdf or svg [default: fleetjax.png]"
+    )
+    plot.add_argument("--overwrite", action="store_true", help="replace an existing file")
+
+    evaluate = commands.add_parser("evaluate", help="run a trained policy without teleoperation")
+    evaluate.add_argument("run", metavar="RUN", type=Path, help="run folder")
+    evaluate.add_argument("--num-steps", metavar="N", type=_integer, default=10_000, help="timesteps [default: 10000]")
+    evaluate.add_argument("--seed", metavar="N", type=_seed, help="random seed [default: the run's, plus 1]")
+    evaluate.add_argument("--overwrite", action="store_true", help="replace the evaluation in the run folder")
+    return parser, list(commands.choices)
+
+
+def _add_run(commands: Any, environment: str | None) -> None:
+    usage = "fleetjax run ENV [--seed N] [--output DIR] [--overwrite] [parameters]"
+    run = commands.add_parser("run", help="run a fleet", usage=usage, description=_RUN_ABOUT, epilog=_RUN_NOTE)
+    run.add_argument("environment", metavar="ENV", help=f"environment: {', '.join(list_envs())}")
+    run.add_argument("--seed", metavar="N", type=_seed, default=0, help="random seed [default: 0]")
+    run.add_argument("--output", metavar="DIR", type=Path, help="run folder [default: a new one below runs/]")
+    run.add_argument("--overwrite", action="store_true", help="replace the run in an existing folder")
+    parameters = run.add_argument_group(f"parameters{f' (defaults of {environment})' if environment else ''}")
+    for name, field in FIELDS.items():
+        if name != "environment":
+            _add_field(parameters, name, field, environment)
+
+
+def _add_field(group: Any, name: str, field: Field, environment: str | None) -> None:
+    unit = f" ({field.unit})" if field.unit else ""
+    options: dict[str, Any] = {"default": argparse.SUPPRESS}
+    if field.kind is bool:
+        options |= {"action": argparse.BooleanOptionalAction}
+    elif field.kind is tuple:
+        options |= {"type": _integer, "nargs": "+", "metavar": "N"}
+    else:
+        kinds = {str: (str, "NAME"), int: (_integer, "N"), float: (_number, "X")}
+        options["type"], options["metavar"] = kinds[field.kind]
+    text = f"{field.help}{unit} [default: {_default(name, environment)}]".replace("%", "%%")
+    group.add_argument(f"--{name.replace('_', '-')}", help=text, **options)
+
+
+def _default(name: str, environment: str | None) -> str:
+    general = getattr(Config, name)
+    if environment:
+        return show(get_defaults(environment).get(name, general))
+    changed = {env: get_defaults(env)[name] for env in list_envs() if get_defaults(env).get(name, general) != general}
+    return "; ".join([show(general), *(f"{env} {show(value)}" for env, value in changed.items())])
+
+
+def show(value: Any) -> str:
+    """Return a value as it is typed on the command line."""
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    if isinstance(value, tuple):
+        return " ".join(map(str, value))
+    return f"{value:g}" if isinstance(value, float) else str(value) or "the environment's own"
+
+
+def _integer(text: str) -> int:
+    value = _number(text)
+    if not math.isfinite(value) or value != int(value) or abs(value) > _LARGEST:
+        raise argparse.ArgumentTypeError(f"{text} must be a whole number, at most {_LARGEST}")
+    return int(value)
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} must be a number") from None
+
+
+def _seed(text: str) -> int:
+    if not text.isascii() or not text.isdecimal() or int(text) > _LARGEST_SEED:
+        raise argparse.ArgumentTypeError(f"{text!r} must be a whole number from 0 to {_LARGEST_SEED}")
+    return int(text)

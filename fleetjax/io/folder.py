@@ -1,0 +1,258 @@
+"""The folder of a run: configuration, per-timestep metrics, figure and trained policy.
+
+`config.json` is written when a run begins, and again last of all with the SHA-256 of the data files, which
+are refused if they do not match. Nothing is executed when it is read.
+"""
+
+import contextlib
+import csv
+import hashlib
+import io
+import itertools
+import json
+import math
+import os
+import re
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import serialization
+
+from fleetjax import envs
+from fleetjax.config import FIELDS, Config, validate
+from fleetjax.learning.imitation import LearnerState, make_learner
+from fleetjax.learning.networks import Normalizer
+from fleetjax.metrics import Metrics
+from fleetjax.version import VERSION
+
+CONFIG, METRICS, FIGURE, POLICY, EVALUATION = "config.json", "metrics.csv", "figure.png", "policy.msgpack", "evaluation.json"
+REALS = ("reward", "uncertainty", "policy_loss")  # the metrics that are no counts
+_LARGEST = 2**31 - 1  # traced integers are i32
+
+
+class Run(NamedTuple):
+    """What a run folder holds.
+
+    Attributes:
+        folder: where it is.
+        config: the configuration.
+        seed: the seed of its key.
+        digests: SHA-256 by file name.
+    """
+
+    folder: Path
+    config: Config
+    seed: int
+    digests: Mapping[str, str]
+
+
+def default_folder(config: Config, seed: int) -> Path:
+    """Return a folder below `runs/` that does not exist yet."""
+    name = f"{config.environment}-{config.algorithm}-seed{seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+    path = Path("runs") / re.sub(r"[^\w.-]", "_", name)
+    others = (path.with_name(f"{path.name}-{i}") for i in itertools.count(2))
+    return next(p for p in itertools.chain([path], others) if not p.exists())
+
+
+def check_free(path: Path, *, overwrite: bool) -> None:
+    """Check that a folder or file can be written without loss.
+
+    Raises:
+        FileExistsError: if something is there, and it is no empty folder, unless `overwrite`.
+    """
+    if not path.exists() or overwrite or (path.is_dir() and not any(path.iterdir())):
+        return
+    raise FileExistsError(f"{path} exists already; choose another --output, or pass --overwrite")
+
+
+def create(path: Path, config: Config, seed: int, *, overwrite: bool) -> None:
+    """Make a run folder with its configuration; an older run in it goes.
+
+    Raises:
+        OSError: if it cannot be made, or exists.
+    """
+    check_free(path, overwrite=overwrite)
+    path.mkdir(parents=True, exist_ok=True)
+    for name in (CONFIG, METRICS, FIGURE, POLICY, EVALUATION):
+        (path / name).unlink(missing_ok=True)
+    write_config(path, config, seed)
+
+
+def discard(path: Path) -> None:
+    """Remove a run folder in which nothing but a configuration was written."""
+    (path / CONFIG).unlink(missing_ok=True)
+    with contextlib.suppress(OSError):  # it holds files of others
+        path.rmdir()
+
+
+def write(path: Path, data: bytes) -> None:
+    """Write a file under a temporary name and rename it, so that it is never seen half-written."""
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        with partial.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a JSON file."""
+    write(path, (json.dumps(content, indent=2) + "\n").encode())
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that a result depends on."""
+    import mujoco
+
+    return {"fleetjax": VERSION, "jax": jax.__version__, "mujoco": mujoco.__version__}
+
+
+def write_config(folder: Path, config: Config, seed: int) -> None:
+    """Write `config.json`: every field, the seed, versions, and the SHA-256 of the data files that are there."""
+    data = {name: folder / name for name in (METRICS, POLICY)}
+    digests = {name: _digest(path.read_bytes()) for name, path in data.items() if path.exists()}
+    content = {"config": to_plain(config), "seed": seed, "versions": versions(), "sha256": digests}
+    write_json(folder / CONFIG, content)
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def to_plain(config: Config) -> dict[str, Any]:
+    """Return the fields as plain Python values; the shortest decimal that stands for each f32."""
+
+    def plain(name: str, value: Any) -> Any:
+        kind = FIELDS[name].kind
+        if kind is tuple:
+            return list(value)
+        return float(str(np.float32(value))) if kind is float else kind(value)
+
+    return {name: plain(name, getattr(config, name)) for name in FIELDS}
+
+
+def write_metrics(folder: Path, metrics: Metrics) -> None:
+    """Write `metrics.csv`: a row a timestep, first column `timestep`."""
+    columns = [np.asarray(x) for x in metrics]
+    rows = io.StringIO(newline="")
+    writer = csv.writer(rows, lineterminator="\n")
+    writer.writerow(("timestep", *Metrics._fields))
+    writer.writerows((t, *row) for t, row in enumerate(zip(*columns, strict=True)))
+    write(folder / METRICS, rows.getvalue().encode())
+
+
+def write_policy(folder: Path, learner: LearnerState) -> None:
+    """Write `policy.msgpack`: the ensemble's parameters [E, ...] and the normalizer, by flax's serialization."""
+    write(folder / POLICY, serialization.to_bytes(_policy(learner)))
+
+
+def _policy(learner: LearnerState) -> dict[str, Any]:
+    return {"params": learner.params, "normalizer": learner.normalizer}
+
+
+@contextlib.contextmanager
+def _blame(path: Path) -> Iterator[None]:
+    """Name the file in the ValueError for content that cannot be used."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise ValueError(f"{path} is missing: not the folder of a finished run") from None
+    except RecursionError:
+        raise ValueError(f"{path} is damaged: nested too deeply") from None
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
+        raise ValueError(f"{path} cannot be used: {error}") from None
+
+
+def read_run(folder: Path) -> Run:
+    """Read and check the configuration of a run folder.
+
+    Raises:
+        ValueError: if it is damaged, or not a run folder of this version; the message has the file and the reason.
+    """
+    if not folder.is_dir():
+        raise ValueError(f"{folder} is not a run folder: {'it is a file' if folder.exists() else 'there is none'}")
+    with _blame(folder / CONFIG):
+        content = json.loads((folder / CONFIG).read_bytes())
+        _expect(isinstance(content, dict) and isinstance(content.get("config"), dict), "it is not fleetjax's")
+        seed, digests = content.get("seed"), content.get("sha256")
+        if not isinstance(seed, int) or not 0 <= seed < 2**32:
+            raise ValueError(f"seed = {seed!r} must be a whole number")
+        if not isinstance(digests, dict):
+            raise ValueError("the SHA-256 of the data files are missing")
+        return Run(folder, _from_plain(content["config"]), seed, digests)
+
+
+def _from_plain(fields: Mapping[str, Any]) -> Config:
+    for problem, names in (("unknown", set(fields) - set(FIELDS)), ("missing", set(FIELDS) - set(fields))):
+        _expect(not names, f"{problem} fields: {', '.join(sorted(names))} (another version of fleetjax?)")
+    for name, value in fields.items():
+        _expect(_fits(value, FIELDS[name].kind), f"{name} = {value!r} must be of type {FIELDS[name].kind.__name__}")
+    config = Config().replace(**fields)
+    validate(config)
+    return config
+
+
+def _expect(holds: bool, otherwise: str) -> None:
+    if not holds:
+        raise ValueError(otherwise)
+
+
+def _is_int(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and abs(value) <= _LARGEST
+
+
+def _fits(value: Any, kind: type) -> bool:
+    if kind is tuple:
+        return isinstance(value, list) and all(map(_is_int, value))
+    if kind is float:
+        return _is_int(value) or (isinstance(value, float) and math.isfinite(value))
+    return _is_int(value) if kind is int else isinstance(value, kind)
+
+
+def _read_data(run: Run, name: str) -> bytes:
+    """Return the content of a data file that is as it was written."""
+    data = (run.folder / name).read_bytes()
+    _expect(run.digests.get(name) == _digest(data), "its SHA-256 is not that in config.json, so it is damaged")
+    return data
+
+
+def read_metrics(run: Run) -> Metrics:
+    """Read the Metrics[T] of a run, as numpy arrays; fewer than `num_steps` rows if it was interrupted.
+
+    Raises:
+        ValueError: if the file is missing, damaged or not a run's.
+    """
+    with _blame(run.folder / METRICS):
+        head, *rows = csv.reader(io.StringIO(_read_data(run, METRICS).decode()))
+        _expect(head == ["timestep", *Metrics._fields], "its columns are not those of this version of fleetjax")
+        _expect(0 < len(rows) <= run.config.num_steps, f"{len(rows)} rows for {run.config.num_steps} timesteps")
+        _expect(all(row[:1] == [str(t)] for t, row in enumerate(rows)), "timesteps are missing")
+        columns = zip(Metrics._fields, list(zip(*rows, strict=True))[1:], strict=True)
+        return Metrics._make(np.array(x, np.float32 if name in REALS else np.int32) for name, x in columns)
+
+
+def read_policy(run: Run) -> LearnerState:
+    """Read the trained policy of a run.
+
+    Raises:
+        ValueError: if the file is missing, damaged or does not fit the configuration.
+    """
+    with _blame(run.folder / POLICY):
+        learner = make_learner(run.config, envs.make(run.config.environment, run.config.backend).spec)
+        size = envs.make(run.config.environment, run.config.backend).spec.observation_size
+        template = learner.init(jax.random.key(0), Normalizer(jnp.zeros(size), jnp.ones(size)))
+        stored = serialization.from_bytes(_policy(template), _read_data(run, POLICY))
+        wanted, found = jax.tree.leaves(_policy(template)), jax.tree.leaves(stored)
+        pairs = zip(wanted, found, strict=True)
+        same = all(isinstance(b, np.ndarray) and (a.shape, a.dtype) == (b.shape, b.dtype) for a, b in pairs)
+        _expect(same, "its arrays do not have the shapes that config.json asks for")
+        _expect(all(np.all(np.isfinite(x)) for x in found), "it holds numbers that are not finite")
+        return template._replace(**jax.tree.map(jnp.asarray, stored))

@@ -1,0 +1,68 @@
+"""Progress of a run on the screen: percent, rate, time left, and the live counts."""
+
+import contextlib
+import sys
+import time
+from collections.abc import Callable, Iterator
+
+from tqdm import tqdm
+
+from fleetjax.config import Config
+from fleetjax.io import text
+from fleetjax.metrics import Metrics
+
+LINES = 10  # that a log gets, where there is no terminal
+
+
+def say(message: str) -> None:
+    """Print a line on stderr, at once."""
+    print(message, file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def progress(config: Config, *, with_rohe: bool = True) -> Iterator[Callable[[Metrics], None]]:
+    """Yield a function that takes the Metrics[C] of each chunk of timesteps and shows how the run stands.
+
+    A terminal gets a bar that is redrawn, anything else a line every tenth of the run.
+
+    Args:
+        config: configuration of the run.
+        with_rohe: whether the return on human effort is among the counts.
+    """
+    total = dict.fromkeys(Metrics._fields, 0.0)
+
+    def counts(chunk: Metrics) -> str:
+        total.update({name: total[name] + more for name, more in text.add_up(chunk).items()})
+        return ", ".join(
+            [f"ROHE {text.rohe_of(total, config):.3f}"] * with_rohe
+            + [f"{text.count(total['successes'])} successes", f"{text.count(total['violations'])} violations"]
+            + [f"{chunk.human_steps[-1]} humans busy", f"{chunk.idle[-1]} idle"]
+        )
+
+    if sys.stderr.isatty():
+        form = "{percentage:3.0f}% |{bar}| {rate_noinv_fmt}, {remaining} left, {desc}"
+        with tqdm(total=config.num_steps, unit="steps", dynamic_ncols=True, bar_format=form, file=sys.stderr) as bar:
+
+            def redraw(chunk: Metrics) -> None:
+                bar.set_description_str(counts(chunk), refresh=False)
+                bar.update(len(chunk.successes))
+
+            yield redraw
+    else:
+        yield _log(config.num_steps, counts)
+
+
+def _log(num_steps: int, counts: Callable[[Metrics], str]) -> Callable[[Metrics], None]:
+    """Return a function that prints a line each time that another tenth of the timesteps is done."""
+    begun, done = time.monotonic(), 0
+
+    def write(chunk: Metrics) -> None:
+        nonlocal done
+        before, done = done, done + len(chunk.successes)
+        shown = counts(chunk)
+        if done * LINES // num_steps > before * LINES // num_steps:
+            rate = done / max(time.monotonic() - begun, 1e-9)
+            left = text.duration((num_steps - done) / rate)
+            say(f"{100 * done // num_steps:3}% {rate:.1f} steps/s, {left} left, {shown}")
+
+    return write

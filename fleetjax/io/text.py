@@ -1,0 +1,144 @@
+"""Numbers, names and tables as people read them."""
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from fleetjax.config import Config
+from fleetjax.metrics import Metrics, rohe
+from fleetjax.priority import get_algorithm
+
+# What the paper calls an algorithm, and what it does.
+_KNOWN = {
+    "constraint": ("Constraint", "the first clone, never updated; humans only reset robots in violation (the paper's BC)"),
+    "random": ("Random", "random robots get help, as much as random_threshold lets through"),
+    "ensemble_dagger": ("Fleet-EnsembleDAgger", "U.C.: uncertain robots first, then robots in violation"),
+    "thrifty_dagger": (
+        "Fleet-ThriftyDAgger",
+        "U.G.C.: robots uncertain or unlikely to reach their goal first, then in violation",
+    ),
+    "expert": ("Expert", "every robot is teleoperated and nothing is learnt: the upper bound"),
+    "cur": ("C.U.R.", "robots in violation first, then by uncertainty, then by risk: the paper's proposal"),
+}
+LETTERS = "any order of distinct letters out of c (violation), u (uncertainty), r (risk), first letter first"
+
+
+def is_order(algorithm: str) -> bool:
+    """Return whether a name is an order of distinct letters out of C, U and R."""
+    return bool(algorithm) and set(algorithm) <= set("cur") and len(set(algorithm)) == len(algorithm)
+
+
+def label(algorithm: str) -> str:
+    """Return the name that the paper gives an algorithm.
+
+    >>> label("cur"), label("uc"), label("expert"), label("my_rule")
+    ('C.U.R.', 'U.C.', 'Expert', 'my_rule')
+    """
+    if algorithm in _KNOWN:
+        return _KNOWN[algorithm][0]
+    return "".join(f"{letter.upper()}." for letter in algorithm) if is_order(algorithm) else algorithm
+
+
+def meaning(algorithm: str) -> str:
+    """Return what an algorithm does, in one line; of one that users registered, the first line of its docstring."""
+    if algorithm in _KNOWN:
+        return _KNOWN[algorithm][1]
+    lines = (get_algorithm(algorithm).make_priority.__doc__ or "").strip().splitlines()
+    return lines[0] if lines else ""
+
+
+def count(number: float) -> str:
+    """Return a whole number with its thousands set apart.
+
+    >>> count(18201)
+    '18,201'
+    """
+    return f"{int(number):,}"
+
+
+def share(part: float, whole: float) -> str:
+    """Return a percentage, or a dash where there is nothing to share.
+
+    >>> share(1, 8), share(0, 0)
+    ('12.5 %', '-')
+    """
+    return f"{100 * part / whole:.1f} %" if whole else "-"
+
+
+def duration(seconds: float) -> str:
+    """Return a time span with the unit that suits it.
+
+    >>> duration(3.21), duration(94), duration(7322)
+    ('3.2 s', '1:34 min', '2:02:02 h')
+    """
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02} h" if hours else f"{minutes}:{rest:02} min"
+
+
+def table(rows: Iterable[Sequence[str]], *, right: Sequence[int] = ()) -> str:
+    """Return rows as aligned columns.
+
+    Args:
+        rows: cells; all rows have as many.
+        right: columns that are aligned to the right.
+
+    >>> print(table([("idle", "7", "steps"), ("moving", "1,193", "steps")], right=[1]))
+    idle        7  steps
+    moving  1,193  steps
+    """
+    rows = [tuple(row) for row in rows]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+
+    def line(row: Sequence[str]) -> str:
+        cells = (cell.rjust(w) if i in right else cell.ljust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True)))
+        return "  ".join(cells).rstrip()
+
+    return "\n".join(map(line, rows))
+
+
+def headline(config: Config, seed: int) -> str:
+    """Return what is run, in one line."""
+    return (
+        f"{label(config.algorithm)} on {config.environment}: {count(config.num_robots)} robots, "
+        f"{count(config.num_humans)} humans, {count(config.num_steps)} timesteps, seed {seed}"
+    )
+
+
+def add_up(metrics: Metrics) -> dict[str, float]:
+    """Return the totals of Metrics[T], by name."""
+    return {name: np.sum(np.asarray(x), dtype=float).item() for name, x in metrics._asdict().items()}
+
+
+def rohe_of(total: Mapping[str, float], config: Config) -> float:
+    """Return the return on human effort that totals amount to."""
+    return float(rohe(Metrics._make(np.array([x], np.float32) for x in total.values()), config)[-1])
+
+
+def run_table(metrics: Metrics, config: Config) -> str:
+    """Return the table that ends a run: the paper's four measures and how human time was spent."""
+    total = add_up(metrics)
+    steps = len(metrics.successes)
+    robot_steps, human_steps = steps * config.num_robots, steps * config.num_humans
+    rows = [
+        ("successes", count(total["successes"]), ""),
+        ("violations", count(total["violations"]), "the paper's hard resets"),
+        ("hard resets", count(total["hard_resets"]), "completed by a human"),
+        ("idle time", count(total["idle"]), f"robot timesteps, {share(total['idle'], robot_steps)} of all"),
+        ("human time", count(total["human_steps"]), f"human timesteps, {share(total['human_steps'], human_steps)} of all"),
+        ("teleoperation", count(total["teleop_steps"]), f"human timesteps, {share(total['teleop_steps'], human_steps)} of all"),
+        ("switches", count(total["switches"]), "starts and ends of help"),
+        ("decided by risk", share(total["risk_choices"], total["choices"]), f"of {count(total['choices'])} choices of a robot"),
+        ("ROHE", f"{rohe_of(total, config):.3f}", "return on human effort, per 100 human timesteps"),
+    ]
+    return table(rows, right=[1])
+
+
+def evaluation_table(metrics: Metrics, config: Config) -> str:
+    """Return the row of the paper's table of trained policies, with its head."""
+    total = add_up(metrics)
+    head = ("policy", "successes", "hard resets", "idle time")
+    row = (label(config.algorithm), count(total["successes"]), count(total["violations"]), count(total["idle"]))
+    return table([head, row], right=[1, 2, 3])

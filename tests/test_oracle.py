@@ -1,0 +1,117 @@
+"""The fleet against the NumPy oracle of the whole loop, step by step, on navigation and on a toy with new goals."""
+
+import ast
+import inspect
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import toy_envs
+from reference import oracle, recording
+
+import fleetjax
+from fleetjax import envs
+
+SMALL = {
+    "num_robots": 8,
+    "num_steps": 200,
+    "hidden_sizes": (8,),
+    "ensemble_size": 3,
+    "batch_size": 16,
+    "critic_capacity": 250,  # less than the transitions of a run: the ring overwrites
+    "num_demonstrations": 16,
+    "learning_rate": 3e-3,
+}
+
+# Algorithm, number of humans, and traced settings that share one compilation.
+CASES = {
+    "cur": ("cur", 3, [
+        {"min_teleop_time": 5, "hard_reset_time": 5},
+        {"min_teleop_time": 7, "hard_reset_time": 3, "initial_period": 60, "risk_threshold": 0.4},
+        {"min_teleop_time": 2, "hard_reset_time": 6, "uncertainty_threshold": 1.0, "risk_threshold": 0.45},
+        {"min_teleop_time": 1, "hard_reset_time": 1, "absence": 0.2},
+    ]),
+    "cu, one human": ("cu", 1, [
+        {"min_teleop_time": 3, "hard_reset_time": 4},
+        {"min_teleop_time": 6, "hard_reset_time": 2, "absence": 0.2},
+    ]),
+    "random, as many humans as robots": ("random", 8, [
+        {"random_threshold": 0.7, "min_teleop_time": 2, "hard_reset_time": 3, "absence": 0.05},
+    ]),
+    "ensemble_dagger": ("ensemble_dagger", 3, [
+        {"min_teleop_time": 3, "hard_reset_time": 5, "uncertainty_threshold": 0.02},
+        {"min_teleop_time": 6, "hard_reset_time": 1, "initial_period": 50},
+    ]),
+    "thrifty_dagger": ("thrifty_dagger", 2, [{"thrifty_threshold": 0.8, "hard_reset_time": 3}]),
+    "constraint": ("constraint", 2, [{"hard_reset_time": 4}]),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module", autouse=True)
+def toy_supervisors():
+    with toy_envs.registered_supervisors():
+        yield
+
+
+def run_both(env, configs: list[fleetjax.Config], absences: list[float], seed: int = 0):
+    """Return the trace of each configuration and what the oracle saw; they differ in traced fields only."""
+
+    def run(config, absence, key):
+        key_start, key_run = jax.random.split(key)
+        state = recording.start(config, env, key_start)
+        return recording.record(config, env, fleetjax.make_fleet(config, env), state, key_run, absence)
+
+    keys = jax.random.split(jax.random.key(seed), len(configs))
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *configs)
+    traces = jax.jit(jax.vmap(run), compiler_options=recording.QUICK_COMPILE)(stacked, jnp.array(absences), keys)
+    traces = jax.tree.map(np.asarray, traces)
+    each = [jax.tree.map(lambda x, k=k: x[k], traces) for k in range(len(configs))]
+    return each, [recording.compare(config, env, trace) for config, trace in zip(configs, each, strict=True)]
+
+
+def total(outcomes: list[oracle.Outcome], name: str) -> int:
+    return sum(outcome.metrics[name] for outcome in outcomes)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_fleet_agrees_with_the_oracle_on_navigation(case):
+    algorithm, num_humans, settings = CASES[case]
+    absences = [setting.get("absence", 0.0) for setting in settings]
+    traced = [{k: v for k, v in setting.items() if k != "absence"} for setting in settings]
+    made = [fleetjax.make_config("navigation", algorithm, **SMALL, num_humans=num_humans, **kw) for kw in traced]
+    traces, outcomes = run_both(envs.make("navigation"), made, absences)
+    for trace, seen in zip(traces, outcomes, strict=True):
+        # The comparison means something only if things happened.
+        assert total(seen, "violations") > 0
+        assert total(seen, "human_steps") > 0
+        if algorithm != "constraint":
+            assert total(seen, "hard_resets") + total(seen, "successes") > 0
+            assert int(trace.last.human_data.pairs.added) > 20
+        for ring in trace.last.critics.values():
+            assert int(ring.negatives.added) > ring.negatives.rows.violation.shape[0]
+
+
+def test_fleet_agrees_with_the_oracle_where_successes_bring_new_goals():
+    env = toy_envs.scripted([0, 9, 14, 0, 17], [4, 6, 5, 3, 0], horizon=20, new_goals=True)
+    config = fleetjax.make_config(
+        env, "cur", **SMALL | {"num_robots": 5, "num_steps": 80}, num_humans=2, initial_period=15, uncertainty_threshold=0.2
+    )
+    [trace], [outcomes] = run_both(env, [config], [0.1])
+    assert sum(len(outcome.new_goals) for outcome in outcomes) > 20
+    assert sum(len(outcome.soft_resets) for outcome in outcomes) > 3
+    assert sum(len(outcome.hard_resets) for outcome in outcomes) > 3
+    goals = trace.env.obs[:, :, 2]
+    assert goals.max() >= 4
+
+
+def test_oracle_imports_neither_fleetjax_nor_jax():
+    tree = ast.parse(inspect.getsource(oracle))
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
+    names = {getattr(node, "module", None) or node.names[0].name for node in imports}
+    assert names == {"dataclasses", "typing", "numpy"}
+
+
+def test_disagreement_is_named():
+    with pytest.raises(AssertionError, match="allocation differs at t = 3"):
+        recording.same("allocation", 3, np.array([1, 0]), [0, 1])

@@ -165,7 +165,7 @@ def allocate(problem: Problem, fleet: Fleet, p: list[float], tie_order: np.ndarr
                     alpha[i, j] = 1
                 if fleet.type[i] == TELEOP and fleet.duration[i] < problem.min_teleop_time:
                     alpha[i, j] = 1
-    bound_robots, bound_humans = alpha.any(axis=1), alpha.any(axis=0)
+    bound_robots, bound_humans = alpha.sum(axis=1), alpha.sum(axis=0)
 
     waiting = [i for i in tie_order if p[i] > 0 and not bound_robots[i]]
     waiting.sort(key=lambda i: -p[i])  # a stable sort: robots of equal score stay in random order
@@ -190,7 +190,7 @@ def timestep(problem: Problem, fleet: Fleet, given: Recorded) -> tuple[Fleet, Ou
     # Who gets help, of which type, and for how long already.
     p = scores(problem, fleet, given)
     alpha = allocate(problem, fleet, p, given.tie_order, given.available)
-    helped = alpha.any(axis=1)
+    helped = alpha.sum(axis=1)
     kind = [(HARD_RESET if c[i] else TELEOP) if helped[i] else NOTHING for i in robots]
     before = [fleet.duration[i] if goes_on(problem, fleet, alpha, kind, i) else 0 for i in robots]
     duration = [before[i] + 1 if helped[i] else 0 for i in robots]

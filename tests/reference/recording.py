@@ -168,7 +168,7 @@ def compare(config: Config, env: Env, trace: Trace) -> list[oracle.Outcome]:
     effort, outcomes = np.asarray(rohe(trace.metrics, config)), []
     for t in range(trace.metrics.idle.shape[0]):
         row = jax.tree.map(lambda x, t=t: x[t], trace._replace(first=None, last=None))
-        recorded = {name: state_of(x) if isinstance(x, EnvState) else x for name, x in row.recorded.items()}
+        recorded: dict[str, Any] = {k: state_of(x) if isinstance(x, EnvState) else x for k, x in row.recorded.items()}
         fleet, outcome = oracle.timestep(problem, fleet, oracle.Recorded(**recorded))
         _compare_plan(row.plan, outcome, t)
         _compare_after(row, fleet, outcome, t)
@@ -221,8 +221,8 @@ def rows_of(items: list[tuple], k: int, like: np.ndarray) -> np.ndarray:
     return np.array([item[k] for item in items], like.dtype).reshape(-1, *like.shape[1:])
 
 
-def matrix(robot: np.ndarray, num_robots: int) -> np.ndarray:
-    """Return alpha, 0 and 1 [N, M], from the robot of each human."""
+def matrix(robot: Any, num_robots: int) -> np.ndarray:
+    """Return alpha, 0 and 1 [N, M], from the robot i32[M] of each human."""
     return (np.arange(num_robots)[:, None] == robot[None, :]).astype(int)
 
 
@@ -234,5 +234,7 @@ def by_human(alpha: np.ndarray, duration: list[int]) -> np.ndarray:
 def same(name: str, t: int, actual: Any, expected: Any) -> None:
     """Raise an AssertionError that names the quantity unless both agree: floats to 1e-5, all else exactly."""
     actual, expected = np.asarray(actual), np.asarray(expected)
-    agree = np.allclose(actual, expected, rtol=1e-5, atol=1e-5) if actual.dtype.kind == "f" else np.array_equal(actual, expected)
+    agree = (
+        np.allclose(actual, expected, rtol=1e-5, atol=1e-5) if actual.dtype.kind == "f" else np.array_equal(actual, expected)
+    )
     assert agree, f"{name} differs at t = {t}:\nfleet  {actual}\noracle {expected}"

@@ -6,9 +6,21 @@ from typing import Any, NamedTuple
 
 import jax
 
+from fleetjax.envs.adapters import from_brax, from_playground
 from fleetjax.envs.base import Env, EnvSpec, begin, proceed
 
-__all__ = ["Env", "EnvSpec", "begin", "get_defaults", "list_envs", "make", "proceed", "register_env"]
+__all__ = [
+    "Env",
+    "EnvSpec",
+    "begin",
+    "from_brax",
+    "from_playground",
+    "get_defaults",
+    "list_envs",
+    "make",
+    "proceed",
+    "register_env",
+]
 
 # Human timesteps, hard resets included, that C.U.R. asked for in a run with default settings; the `constraint` baseline gets
 # as many extra demonstrations. Measured by `python experiments/human_time.py` (mean of three seeds).

@@ -1,13 +1,17 @@
 """MuJoCo XLA behind the physics contract: pure JAX, forward-mode differentiable, for GPUs, TPUs and CPUs."""
 
+import contextlib
+import io
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import mujoco
-from mujoco import mjx
 
 from fleetjax.physics.base import PhysicsState, contain_divergence
+
+with contextlib.redirect_stdout(io.StringIO()):  # where warp is missing, MJX prints so
+    from mujoco import mjx
 
 
 def make_step(model: mujoco.MjModel, substeps: int) -> Callable[[PhysicsState, jax.Array, jax.Array], PhysicsState]:

@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco import rollout
@@ -94,6 +95,7 @@ def make_step(model: mujoco.MjModel, substeps: int) -> Callable[[PhysicsState, j
         after, failed = jax.pure_callback(
             simulator, (shapes, jax.ShapeDtypeStruct((), bool)), *arrays, control, active, vmap_method="broadcast_all"
         )
-        return contain_divergence(state, PhysicsState(*after, diverged=state.diverged), failed=failed)
+        after = contain_divergence(state, PhysicsState(*after, diverged=state.diverged), failed=failed)
+        return after._replace(diverged=jnp.where(active, after.diverged, state.diverged))
 
     return step

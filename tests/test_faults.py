@@ -216,7 +216,8 @@ def run_against_the_oracle(algorithm: str, make: Callable[[fleetjax.Config, Env]
     )
 
     def run(config, key):
-        return recording.record(config, env, make(config, env), recording.start(config, env, key), key, absence=0.05)
+        start = recording.start(config, env, key)
+        return recording.record(config, env, make(config, env), start, key, absence=0.05, silence=0.05)
 
     trace = jax.jit(run, compiler_options=recording.QUICK_COMPILE)(config, jax.random.key(0))
     recording.compare(config, env, trace)

@@ -60,7 +60,7 @@ def run_both(env, configs: list[fleetjax.Config], absences: list[float], seed: i
     def run(config, absence, key):
         key_start, key_run = jax.random.split(key)
         state = recording.start(config, env, key_start)
-        return recording.record(config, env, fleetjax.make_fleet(config, env), state, key_run, absence)
+        return recording.record(config, env, fleetjax.make_fleet(config, env), state, key_run, absence, silence=absence)
 
     keys = jax.random.split(jax.random.key(seed), len(configs))
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *configs)

@@ -56,7 +56,9 @@ def start(config: Config, env: Env, key: jax.Array) -> FleetState:
     )
 
 
-def record(config: Config, env: Env, fleet: Fleet, state: FleetState, key: jax.Array, absence: Any = 0.0) -> Trace:
+def record(
+    config: Config, env: Env, fleet: Fleet, state: FleetState, key: jax.Array, absence: Any = 0.0, silence: Any = 0.0
+) -> Trace:
     """Run `config.num_steps` timesteps and write everything down.
 
     Args:
@@ -65,7 +67,8 @@ def record(config: Config, env: Env, fleet: Fleet, state: FleetState, key: jax.A
         fleet: the fleet under test.
         state: where it starts.
         key: random key of the run.
-        absence: chance that a human is not there, or a teleoperator gives no action.
+        absence: chance that a human is not there.
+        silence: chance that a teleoperator gives no action.
     """
     n, m = config.num_robots, config.num_humans
     learner = imitation.make_learner(config, env.spec)
@@ -97,7 +100,7 @@ def record(config: Config, env: Env, fleet: Fleet, state: FleetState, key: jax.A
             "uniform": jax.random.uniform(key_score, (n,)),
             "tie_order": draw_permutation(key_ties, n),
             "available": jax.random.uniform(key_available, (m,)) >= absence,
-            "present": jax.random.uniform(key_present, (n,)) >= absence,
+            "present": jax.random.uniform(key_present, (n,)) >= silence,
             "robot_action": robot_action,
             "human_action": human_action,
             "fresh": jax.vmap(env.reset)(jax.random.split(key_reset, n), jnp.arange(n)),

@@ -4,6 +4,7 @@ The raw environment is used, without the wrappers that reset it by themselves or
 unhealthy end, which is a violation here; the horizon is ours. Pass what these functions return to `run(..., env=env)`.
 """
 
+import importlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -29,8 +30,7 @@ def from_brax(
     Raises:
         ValueError: if brax has no environment of that name.
     """
-    import fleetjax.physics.mjx  # noqa: F401  # brax imports mujoco.mjx, which prints unless it was imported here before
-
+    importlib.import_module("fleetjax.physics.mjx")  # brax imports MJX, which prints unless it was imported there before
     from brax import envs as brax_envs
 
     known = brax_envs._envs  # brax lists its environments nowhere else
@@ -56,10 +56,9 @@ def from_playground(
         ImportError: if Playground is not installed.
         ValueError: if Playground has no environment of that name.
     """
-    import fleetjax.physics.mjx  # noqa: F401  # as above
-
+    importlib.import_module("fleetjax.physics.mjx")  # as above
     try:
-        from mujoco_playground import registry
+        registry = importlib.import_module("mujoco_playground").registry
     except ImportError as error:
         raise ImportError(f'from_playground needs MuJoCo Playground: pip install "fleetjax[playground]" ({error})') from error
 

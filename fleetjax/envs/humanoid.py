@@ -50,7 +50,7 @@ def make_env(*, backend: str = "auto", success_return: float | None = None) -> b
         del key  # deterministic
         action = jnp.clip(action, -1.0, 1.0)
         body = physics.step(state.physics, action, active)
-        obs = observe(joints, body, action)
+        obs = observe(joints, body, jnp.nan_to_num(action))  # an action that is no number makes the body diverge
         violation = (body.qpos[2] < FALL_HEIGHT) | body.diverged
         reward = jnp.where(violation, -1.0, _reward(joints, physics, state.physics, body, obs, action))
         return base.proceed(

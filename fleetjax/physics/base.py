@@ -29,7 +29,7 @@ class PhysicsState(NamedTuple):
         warmstart: f32[nv] acceleration that warm-starts the constraint solver (m/s^2, rad/s^2).
         sensors: f32[ns] sensor data, one substep behind `qpos`.
         time: f32[] simulated time since the reset (s).
-        diverged: bool[] whether the last step left the finite numbers; the other fields are then those before it.
+        diverged: bool[] whether the last step left all bounds; the other fields are then those before it.
     """
 
     qpos: jax.Array
@@ -71,15 +71,15 @@ def initial_state(model: mujoco.MjModel) -> PhysicsState:
 
 
 def contain_divergence(before: PhysicsState, after: PhysicsState, *, failed: jax.Array) -> PhysicsState:
-    """Return `after`, or `before` marked as diverged where the step failed or left the finite numbers.
+    """Return `after`, or `before` marked as diverged where the step failed or left the numbers that MuJoCo accepts.
 
     Args:
         before: the state that was stepped.
         after: what the backend made of it.
         failed: bool[] the backend's own verdict.
     """
-    finite = jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(after)])
-    diverged = failed | ~jnp.all(finite)
+    accepted = jnp.array([jnp.all(jnp.abs(leaf) < mujoco.mjMAXVAL) for leaf in after[:-1]])  # neither NaN nor infinity is
+    diverged = failed | ~jnp.all(accepted)
     kept = jax.tree.map(lambda old, new: jnp.where(diverged, old, new), before, after)
     return kept._replace(diverged=diverged)
 

@@ -15,8 +15,9 @@ from fleetjax.types import EnvState
 HORIZON = 250
 CONTROL_STEP = 0.1  # s
 TOP_SPEED = 0.5  # m/s, reached when the full action is held
-INERTIA = 0.8  # share of the velocity that one control step keeps
-NOISE = 0.05  # m/s, deviation of the push in one control step
+INERTIA = 0.95  # share of the velocity that one control step keeps
+TEACHER_GAIN = 1.5  # 1/s, wanted speed for each metre to go
+NOISE = 0.01  # m/s, deviation of the push in one control step
 GOAL_RADIUS = 0.08  # m
 WALLS_X = np.array([-1 / 3, 1 / 3], np.float32)  # m, where the walls stand
 DOORS_Y = np.array([0.5, -0.5], np.float32)  # m, centres of their doorways
@@ -92,7 +93,7 @@ def teach(state: EnvState) -> jax.Array:
     target = jnp.where(side == 0, goal, jnp.where(aligned, beyond, before))
     in_doorway = jnp.abs(position[0] - jnp.asarray(WALLS_X)) < 0.1
     target = jnp.where((side == 0) & jnp.any(in_doorway), _clear_of_doorway(position, target, in_doorway), target)
-    wanted = 4.0 * (target - position)
+    wanted = TEACHER_GAIN * (target - position)
     wanted /= jnp.maximum(jnp.linalg.norm(wanted) / (0.8 * TOP_SPEED), 1.0)
     return jnp.clip((2 * wanted - velocity) / TOP_SPEED, -1.0, 1.0)
 

@@ -38,11 +38,10 @@ def make_env(*, backend: str = "auto", success_return: float | None = None) -> b
 
     def reset(key: jax.Array, robot: jax.Array) -> EnvState:
         del robot  # every robot starts from the same distribution
-        key_angles, key_velocities = jax.random.split(key)
-        angles = jnp.clip(jax.random.uniform(key_angles, (21,), minval=-0.2, maxval=0.2), joints.low, joints.high)
-        velocities = jax.random.uniform(key_velocities, (21,), minval=-0.1, maxval=0.1)
+        noise = jax.random.uniform(key, (2, 21), minval=-1.0, maxval=1.0)
+        angles = jnp.clip(0.2 * noise[0], joints.low, joints.high)
         body = physics.initial._replace(
-            qpos=physics.initial.qpos.at[7:].set(angles), qvel=physics.initial.qvel.at[6:].set(velocities)
+            qpos=physics.initial.qpos.at[7:].set(angles), qvel=physics.initial.qvel.at[6:].set(0.1 * noise[1])
         )
         return base.begin(body, observe(joints, body, jnp.zeros(21)))
 

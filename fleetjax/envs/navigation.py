@@ -34,18 +34,19 @@ def make_env() -> base.Env:
 
 def _reset(key: jax.Array, robot: jax.Array) -> EnvState:
     del robot  # every robot starts from the same distribution
-    key_rooms, key_start, key_goal = jax.random.split(key, 3)
-    start_room, goal_room = jax.random.choice(key_rooms, 3, (2,), replace=False)
-    position, goal = _place(key_start, start_room), _place(key_goal, goal_room)
+    draw = jax.random.uniform(key, (6,))
+    start_room = jnp.floor(3 * draw[0])
+    goal_room = (start_room + 1 + jnp.floor(2 * draw[1])) % 3  # another one
+    position, goal = _place(draw[2:4], start_room), _place(draw[4:6], goal_room)
     physics = jnp.concatenate([position, jnp.zeros(2), goal])
     return base.begin(physics, _observe(physics))
 
 
-def _place(key: jax.Array, room: jax.Array) -> jax.Array:
-    """Draw a point f32[2] in room 0, 1 or 2, away from its walls."""
+def _place(draw: jax.Array, room: jax.Array) -> jax.Array:
+    """Return the point f32[2] of room 0, 1 or 2, away from its walls, that `draw` f32[2] in [0, 1) stands for."""
     half = jnp.array([1 / 3 - MARGIN, 1 - MARGIN])
-    centre = jnp.array([(room - 1) * 2 / 3, 0.0])
-    return centre + jax.random.uniform(key, (2,), minval=-half, maxval=half)
+    centre = jnp.stack([(room - 1) * 2 / 3, jnp.zeros(())])
+    return centre + (2 * draw - 1) * half
 
 
 def _observe(physics: jax.Array) -> jax.Array:

@@ -16,7 +16,8 @@ from fleetjax.io import text
 from fleetjax.io.folder import to_plain
 from fleetjax.metrics import Metrics, rohe
 
-PANELS = ("Cumulative successes", "Cumulative hard resets", "Cumulative idle time", "Return on human effort")
+PANELS = ("Cumulative successes", "Cumulative hard resets", "Cumulative idle timesteps", "Return on human effort")
+_LEGEND_WIDTH = 165  # letters that fit into a row
 FORMATS = (".png", ".pdf", ".svg")
 # Okabe and Ito's palette: told apart with every common kind of colour vision. One colour for an algorithm, always.
 _COLOURS = {
@@ -43,6 +44,8 @@ _STYLE: dict[Any, Any] = {
     "xtick.color": "#555555",
     "ytick.color": "#555555",
     "legend.frameon": False,
+    "legend.fontsize": 10,
+    "legend.title_fontsize": 9,
     "svg.fonttype": "none",
 }
 
@@ -97,6 +100,8 @@ def _labels(settings: Sequence[dict[str, Any]]) -> list[str]:
     for fields in settings:
         alike = [other for other in settings if other["algorithm"] == fields["algorithm"]]
         differing = [name for name in fields if any(other[name] != fields[name] for other in alike)]
+        if len(differing) > 1 and "human_capacity" in differing:
+            differing.remove("human_capacity")  # it follows from the others
         if len({other["environment"] for other in settings}) > 1:
             differing = ["environment"]  # whose defaults differ in more than can be read
         extra = [fields[name] if name == "environment" else f"{name} {fields[name]}" for name in differing]
@@ -105,44 +110,55 @@ def _labels(settings: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def draw(groups: Sequence[Curves], title: str = "") -> Figure:
-    """Draw each group in every panel: the mean over its seeds, and a band of one standard deviation."""
+    """Draw each group in every panel: the mean over its seeds, and a band of one standard deviation.
+
+    Args:
+        groups: what to draw.
+        title: takes the place of the legend.
+    """
     with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(12.5, 3.4), layout="constrained")
+        figure = Figure(figsize=(12.5, 3.2), layout="constrained")
+        figure.get_layout_engine().set(w_pad=0.12)  # pyright: ignore[reportOptionalMemberAccess]
         axes = figure.subplots(1, len(PANELS))
         styles = _styles([curves.algorithm for curves in groups])
+        labels = [curves.label for curves in groups]
+        if len({len(curves.values) for curves in groups}) > 1:
+            labels = [f"{curves.label} ({text.plural(len(curves.values), 'seed')})" for curves in groups]
         for panel, (ax, name) in enumerate(zip(axes, PANELS, strict=True)):
             _prepare_axes(ax, name)
-            for curves, (colour, dashes) in zip(groups, styles, strict=True):
+            for curves, label, (colour, dashes) in zip(groups, labels, styles, strict=True):
                 seeds = curves.values[:, panel]
                 t, mean = np.arange(1, seeds.shape[1] + 1), seeds.mean(axis=0)
-                ax.plot(t, mean, color=colour, linestyle=dashes, linewidth=1.8, label=_legend(curves))
+                ax.plot(t, mean, color=colour, linestyle=dashes, linewidth=1.8, label=label)
                 if len(seeds) > 1:
                     deviation = seeds.std(axis=0, ddof=1)
                     ax.fill_between(t, mean - deviation, mean + deviation, color=colour, alpha=0.2, linewidth=0)
             ax.set_xlim(0, max(curves.values.shape[2] for curves in groups))
             ax.set_ylim(bottom=0)
-        handles, labels = axes[0].get_legend_handles_labels()
-        columns = min(len(labels), 4)
-        figure.legend(handles, labels, loc="outside upper left", ncols=columns, title=title or None, alignment="left")
+        if title:  # it says what the only line is
+            figure.suptitle(title, x=0.008, ha="left", fontsize=11)
+        else:
+            columns = max(1, min(len(labels), _LEGEND_WIDTH // (7 + max(map(len, labels)))))
+            figure.legend(axes[0].get_lines(), labels, loc="outside upper left", ncols=columns, alignment="left", title=_note(groups))
     return figure
 
 
-def _legend(curves: Curves) -> str:
-    seeds = len(curves.values)
-    return f"{curves.label} ({seeds} seeds, ± 1 s.d.)" if seeds > 1 else curves.label
+def _note(groups: Sequence[Curves]) -> str | None:
+    """Return what lines and bands are, where there are several seeds."""
+    seeds = {len(curves.values) for curves in groups}
+    number = f" of {max(seeds)} seeds" if len(seeds) == 1 else ""
+    return f"mean{number}, band of one standard deviation" if max(seeds) > 1 else None
 
 
 def _prepare_axes(ax: Axes, name: str) -> None:
     ax.set_title(name)
     ax.set_xlabel("timesteps")
-    if name == PANELS[2]:
-        ax.set_ylabel("robot timesteps")
-    ax.xaxis.set_major_locator(MaxNLocator(4, integer=True))
-    ax.yaxis.set_major_locator(MaxNLocator(5))
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:,.0f}"))
+    counts = FuncFormatter(lambda number, _: f"{number:,.0f}")
+    ax.xaxis.set_major_locator(MaxNLocator(4, integer=True, steps=[1, 2, 2.5, 5, 10]))
+    ax.xaxis.set_major_formatter(counts)
+    ax.yaxis.set_major_locator(MaxNLocator(5, integer=name != PANELS[3], steps=[1, 2, 2.5, 5, 10]))
     if name != PANELS[3]:
-        ax.yaxis.set_major_locator(MaxNLocator(5, integer=True))
-        ax.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:,.0f}"))
+        ax.yaxis.set_major_formatter(counts)
 
 
 def _styles(algorithms: Sequence[str]) -> list[tuple[str, Any]]:

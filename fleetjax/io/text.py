@@ -56,6 +56,15 @@ def count(number: float) -> str:
     return f"{int(number):,}"
 
 
+def plural(number: int, thing: str) -> str:
+    """Return how many there are of a thing.
+
+    >>> plural(1, "seed"), plural(3, "seed")
+    ('1 seed', '3 seeds')
+    """
+    return f"{count(number)} {thing}{'' if number == 1 else 's'}"
+
+
 def share(part: float, whole: float) -> str:
     """Return a percentage, or a dash where there is nothing to share.
 
@@ -102,8 +111,8 @@ def table(rows: Iterable[Sequence[str]], *, right: Sequence[int] = ()) -> str:
 def headline(config: Config, seed: int) -> str:
     """Return what is run, in one line."""
     return (
-        f"{label(config.algorithm)} on {config.environment}: {count(config.num_robots)} robots, "
-        f"{count(config.num_humans)} humans, {count(config.num_steps)} timesteps, seed {seed}"
+        f"{label(config.algorithm)} on {config.environment}: {plural(config.num_robots, 'robot')}, "
+        f"{plural(config.num_humans, 'human')}, {plural(config.num_steps, 'timestep')}, seed {seed}"
     )
 
 

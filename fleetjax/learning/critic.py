@@ -112,8 +112,7 @@ def make_critic(kind: str, config: Config, spec: EnvSpec, learner: Learner) -> C
         key_positive, key_negative = jax.random.split(key)
 
         def draw(key: jax.Array, store: buffer.Buffer) -> Transition:
-            index = jax.random.randint(key, (config.batch_size,), 0, jnp.maximum(store.size, 1))
-            return take(store.rows, index)
+            return take(store.rows, buffer.draw_index(key, (config.batch_size,), store.size))
 
         wanted = jnp.arange(config.batch_size) < jnp.round(config.positive_fraction * config.batch_size)
         positive = (wanted & (state.positives.size > 0)) | (state.negatives.size == 0)

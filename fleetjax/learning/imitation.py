@@ -73,7 +73,7 @@ def append(data: HumanData, pairs: Pair, mask: jax.Array, key: jax.Array) -> Hum
     """
     grown = buffer.append(data.pairs, pairs, mask, overwrite=False)
     members = data.resample.shape[0]
-    draws = jax.random.randint(key, (members, mask.shape[0]), 0, jnp.maximum(grown.size, 1))
+    draws = buffer.draw_index(key, (members, mask.shape[0]), grown.size)
     index = buffer.Buffer(data.resample.T, data.pairs.added)
     return HumanData(grown, buffer.append(index, draws.T, mask, overwrite=False).rows.T)
 
@@ -111,7 +111,7 @@ def make_learner(config: Config, spec: EnvSpec) -> Learner:
         return jnp.mean((jnp.tanh(answer) - action) ** 2)
 
     def update(state: LearnerState, data: HumanData, key: jax.Array) -> tuple[LearnerState, jax.Array]:
-        draw = jax.random.randint(key, (members, config.batch_size), 0, jnp.maximum(data.pairs.size, 1))
+        draw = buffer.draw_index(key, (members, config.batch_size), data.pairs.size)
         batch = take(data.pairs.rows, jnp.take_along_axis(data.resample, draw, axis=1))
         losses, grads = jax.vmap(jax.value_and_grad(loss))(state.params, state.normalizer(batch.obs), batch.action)
         steps, opt_state = optimizer.update(grads, state.opt_state)

@@ -1,5 +1,6 @@
 """Seeded faults: each makes the comparison with the NumPy oracle fail, in the quantity that it should spoil."""
 
+import functools
 from collections.abc import Callable
 
 import jax
@@ -7,6 +8,7 @@ import jax.numpy as jnp
 import pytest
 import toy_envs
 from reference import recording
+from reference.recording import quick_jit
 
 import fleetjax
 from fleetjax import allocation, fleet
@@ -194,11 +196,14 @@ def toy_supervisors():
         yield
 
 
-def run_against_the_oracle(algorithm: str, make: Callable[[fleetjax.Config, Env], Fleet]) -> recording.Trace:
-    """Run a fleet of six robots that fall and succeed on schedule, compare it with the oracle, and return its trace."""
-    env = toy_envs.scripted(FALLS_AT, SUCCEEDS_AT, horizon=20)
+ENV = toy_envs.scripted(FALLS_AT, SUCCEEDS_AT, horizon=20)
+
+
+@functools.cache
+def start(algorithm: str) -> tuple[fleetjax.Config, fleetjax.FleetState]:
+    """Return configuration and first state of six robots that fall and succeed on schedule, and their two humans."""
     config = fleetjax.make_config(
-        env,
+        ENV,
         algorithm,
         num_robots=6,
         num_humans=2,
@@ -214,13 +219,18 @@ def run_against_the_oracle(algorithm: str, make: Callable[[fleetjax.Config, Env]
         num_demonstrations=4,
         critic_capacity=1000,
     )
+    return config, quick_jit(lambda key: recording.start(config, ENV, key))(jax.random.key(0))
 
-    def run(config, key):
-        start = recording.start(config, env, key)
-        return recording.record(config, env, make(config, env), start, key, absence=0.05, silence=0.05)
 
-    trace = jax.jit(run, compiler_options=recording.QUICK_COMPILE)(config, jax.random.key(0))
-    recording.compare(config, env, trace)
+def run_against_the_oracle(algorithm: str, make: Callable[[fleetjax.Config, Env], Fleet]) -> recording.Trace:
+    """Run the fleet that `make` builds, compare it with the oracle, and return its trace."""
+    config, first = start(algorithm)
+
+    def run(config, first, key):
+        return recording.record(config, ENV, make(config, ENV), first, key, absence=0.05, silence=0.05)
+
+    trace = quick_jit(run)(config, first, jax.random.key(0))
+    recording.compare(config, ENV, trace)
     return trace
 
 

@@ -1,4 +1,4 @@
-"""The fleet against the NumPy oracle of the whole loop, step by step, on navigation and on a toy with new goals."""
+"""The fleet against the NumPy oracle of the whole loop, step by step, on navigation and on a scripted toy."""
 
 import ast
 import inspect
@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import toy_envs
 from reference import oracle, recording
+from reference.recording import quick_jit
 
 import fleetjax
 from fleetjax import envs
@@ -22,9 +23,12 @@ SMALL = {
     "critic_capacity": 250,  # less than the transitions of a run: the ring overwrites
     "num_demonstrations": 16,
     "learning_rate": 3e-3,
+    "uncertainty_threshold": 0.01,
+    "initial_period": 0,
+    "gradient_steps": 2,
 }
 
-# Algorithm, number of humans, and traced settings that share one compilation.
+# On navigation: algorithm, number of humans, and traced settings that share one compilation.
 CASES = {
     "cur": ("cur", 3, [
         {"min_teleop_time": 5, "hard_reset_time": 5},
@@ -36,16 +40,19 @@ CASES = {
         {"min_teleop_time": 3, "hard_reset_time": 4},
         {"min_teleop_time": 6, "hard_reset_time": 2, "absence": 0.2},
     ]),
-    "random, as many humans as robots": ("random", 8, [
-        {"random_threshold": 0.7, "min_teleop_time": 2, "hard_reset_time": 3, "absence": 0.05},
+    "ensemble_dagger, as many humans as robots": ("ensemble_dagger", 8, [
+        {"min_teleop_time": 3, "hard_reset_time": 5, "uncertainty_threshold": 0.1, "absence": 0.05},
+        {"min_teleop_time": 6, "hard_reset_time": 1, "initial_period": 50, "uncertainty_threshold": 0.05},
     ]),
-    "ensemble_dagger": ("ensemble_dagger", 3, [
-        {"min_teleop_time": 3, "hard_reset_time": 5, "uncertainty_threshold": 0.02},
-        {"min_teleop_time": 6, "hard_reset_time": 1, "initial_period": 50},
-    ]),
-    "thrifty_dagger": ("thrifty_dagger", 2, [{"thrifty_threshold": 0.8, "hard_reset_time": 3}]),
-    "constraint": ("constraint", 2, [{"hard_reset_time": 4}]),
 }  # fmt: skip
+
+# On a scripted toy: algorithm, overrides, and whether a success brings a new goal.
+TOY_CASES = {
+    "cur, new goals": ("cur", {"initial_period": 15, "uncertainty_threshold": 0.2}, True),
+    "thrifty_dagger": ("thrifty_dagger", {"thrifty_threshold": 0.5}, False),
+    "random": ("random", {"random_threshold": 0.7}, False),
+    "constraint": ("constraint", {}, False),
+}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -64,7 +71,7 @@ def run_both(env, configs: list[fleetjax.Config], absences: list[float], seed: i
 
     keys = jax.random.split(jax.random.key(seed), len(configs))
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *configs)
-    traces = jax.jit(jax.vmap(run), compiler_options=recording.QUICK_COMPILE)(stacked, jnp.array(absences), keys)
+    traces = quick_jit(jax.vmap(run))(stacked, jnp.array(absences), keys)
     traces = jax.tree.map(np.asarray, traces)
     each = [jax.tree.map(lambda x, k=k: x[k], traces) for k in range(len(configs))]
     return each, [recording.compare(config, env, trace) for config, trace in zip(configs, each, strict=True)]
@@ -79,30 +86,29 @@ def test_fleet_agrees_with_the_oracle_on_navigation(case):
     algorithm, num_humans, settings = CASES[case]
     absences = [setting.get("absence", 0.0) for setting in settings]
     traced = [{k: v for k, v in setting.items() if k != "absence"} for setting in settings]
-    made = [fleetjax.make_config("navigation", algorithm, **SMALL, num_humans=num_humans, **kw) for kw in traced]
+    made = [fleetjax.make_config("navigation", algorithm, **SMALL | kw, num_humans=num_humans) for kw in traced]
     traces, outcomes = run_both(envs.make("navigation"), made, absences)
-    for trace, seen in zip(traces, outcomes, strict=True):
-        # The comparison means something only if things happened.
-        assert total(seen, "violations") > 0
-        assert total(seen, "human_steps") > 0
-        if algorithm != "constraint":
-            assert total(seen, "hard_resets") + total(seen, "successes") > 0
-            assert int(trace.last.human_data.pairs.added) > 20
+    # The comparison means something only if things happened.
+    for name in ("violations", "hard_resets", "successes", "teleop_steps", "switches"):
+        assert sum(total(seen, name) for seen in outcomes) > 0, name
+    for trace in traces:
+        assert int(trace.last.human_data.pairs.added) > 0
         for ring in trace.last.critics.values():
             assert int(ring.negatives.added) > ring.negatives.rows.violation.shape[0]
 
 
-def test_fleet_agrees_with_the_oracle_where_successes_bring_new_goals():
-    env = toy_envs.scripted([0, 9, 14, 0, 17], [4, 6, 5, 3, 0], horizon=20, new_goals=True)
-    config = fleetjax.make_config(
-        env, "cur", **SMALL | {"num_robots": 5, "num_steps": 80}, num_humans=2, initial_period=15, uncertainty_threshold=0.2
-    )
-    [trace], [outcomes] = run_both(env, [config], [0.1])
-    assert sum(len(outcome.new_goals) for outcome in outcomes) > 20
-    assert sum(len(outcome.soft_resets) for outcome in outcomes) > 3
-    assert sum(len(outcome.hard_resets) for outcome in outcomes) > 3
-    goals = trace.env.obs[:, :, 2]
-    assert goals.max() >= 4
+@pytest.mark.parametrize("case", TOY_CASES)
+def test_fleet_agrees_with_the_oracle_on_a_scripted_toy(case):
+    algorithm, overrides, new_goals = TOY_CASES[case]
+    env = toy_envs.scripted([0, 9, 14, 0, 17], [4, 12, 5, 3, 0], horizon=20, new_goals=new_goals)
+    timing = {"min_teleop_time": 4, "hard_reset_time": 3, "num_steps": 80}
+    config = fleetjax.make_config(env, algorithm, **SMALL | timing | overrides | {"num_robots": 5, "num_humans": 2})
+    [trace], [seen] = run_both(env, [config], [0.1])
+    assert total(seen, "hard_resets") > 2
+    assert sum(len(outcome.soft_resets) for outcome in seen) > 5
+    assert sum(len(outcome.new_goals) for outcome in seen) > 20 or not new_goals
+    assert total(seen, "teleop_steps") > 5 or algorithm == "constraint"
+    assert int(trace.last.learner.opt_state.count) == (0 if algorithm == "constraint" else 160)
 
 
 def test_oracle_imports_neither_fleetjax_nor_jax():

@@ -51,7 +51,7 @@ class Recorded(NamedTuple):
     fresh: State  # s^0 ~ p_i^0
     renewed_robot: State  # after_robot with a new goal
     renewed_human: State  # after_human with a new goal
-    resample: np.ndarray  # [E, N] index into D that each member draws for robot i's pair, if there is one
+    resample_bits: np.ndarray  # [E, N] random 32 bits of each member for robot i's pair, if there is one
 
 
 @dataclass
@@ -208,7 +208,7 @@ def timestep(problem: Problem, fleet: Fleet, given: Recorded) -> tuple[Fleet, Ou
             fleet.data.append((s["obs"][i], given.human_action[i]))
         for i in by_human:
             for e, member in enumerate(fleet.resample):
-                member.append(int(given.resample[e, i]))
+                member.append(int(given.resample_bits[e, i]) % len(fleet.data))
     for i in moving:
         store(problem, fleet, (s["obs"][i], action[i], s_next["obs"][i], s_next["violation"][i], s_next["success"][i]))
 

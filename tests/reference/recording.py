@@ -1,5 +1,6 @@
 """Runs a fleet, writes down what the NumPy oracle must be told, and compares the two step by step."""
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -17,7 +18,8 @@ from fleetjax.types import EnvState, HumanState
 from reference import oracle
 
 # Tests compile more than they compute: with these, XLA compiles a fleet in a quarter of the time.
-QUICK_COMPILE = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+_OPTIONS = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+quick_jit = functools.partial(jax.jit, compiler_options=_OPTIONS)
 
 # Bound here, so that a fault seeded in the fleet's own tie-breaking does not reach what is recorded.
 draw_permutation = jax.random.permutation
@@ -99,6 +101,7 @@ def record(
             "goal": chance.get("goal", jnp.zeros(n)),
             "uniform": jax.random.uniform(key_score, (n,)),
             "tie_order": draw_permutation(key_ties, n),
+            "resample_bits": jax.random.bits(key_data, (state.human_data.resample.shape[0], n)),
             "available": jax.random.uniform(key_available, (m,)) >= absence,
             "present": jax.random.uniform(key_present, (n,)) >= silence,
             "robot_action": robot_action,
@@ -113,8 +116,6 @@ def record(
         planned, plan = fleet.plan(state, key_plan, recorded["available"])
         after, metrics = fleet.advance(planned, plan, human_action, recorded["present"], key_advance)
 
-        members, size = after.human_data.resample.shape[0], after.human_data.pairs.size
-        recorded["resample"] = jax.random.randint(key_data, (members, n), 0, jnp.maximum(size, 1))
         return after, (recorded, plan, metrics, after.env, after.humans, count_stored(after))
 
     last, rows = jax.lax.scan(timestep, state, length=config.num_steps)

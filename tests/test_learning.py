@@ -15,7 +15,7 @@ SEEDS = 5
 
 def _success_shares(config, policies, keys):
     """f64[SEEDS] share of finished episodes that reach the goal without a violation."""
-    shape = {"num_steps": 400, "num_robots": 50, "num_humans": 10}
+    shape = {"num_steps": 1000, "num_robots": 100, "num_humans": 10}  # about 1500 episodes
     evaluate = jax.jit(lambda key, policy: fleetjax.evaluate(config.replace(**shape), key, policy).metrics)
     metrics = [evaluate(key, policy) for key, policy in zip(keys, policies, strict=True)]
     successes, violations = (
@@ -27,7 +27,7 @@ def _success_shares(config, policies, keys):
 def test_cur_beats_offline_demonstrations_of_equal_cost_on_navigation():
     """Same human time, same gradient steps, over five seeds: the gap is four standard errors or more."""
     keys = jax.random.split(jax.random.key(0), SEEDS)
-    shared = {"num_robots": 20, "num_humans": 4, "ensemble_size": 3, "hard_reset_time": 2, "human_capacity": 10_000}
+    shared = {"num_robots": 20, "num_humans": 2, "ensemble_size": 3, "hard_reset_time": 1, "human_capacity": 10_000}
     online = fleetjax.make_config("navigation", "cur", risk_threshold=0.3, risk_discount=0.9, **shared)
     prepare, run = jax.jit(fleetjax.prepare), jax.jit(fleetjax.run)
     starts = [prepare(online, key) for key in keys]
@@ -46,7 +46,7 @@ def test_cur_beats_offline_demonstrations_of_equal_cost_on_navigation():
     print(f"first clone {first.round(3)}, C.U.R. {cur.round(3)}, constraint {baseline.round(3)}, human time {human_time}")
     assert np.all(first <= 0.6)
     assert gap.mean() >= 4 * gap.std(ddof=1) / np.sqrt(SEEDS)
-    assert gap.mean() > 0.03
+    assert gap.mean() > 0.04
 
 
 def test_navigation_teacher_succeeds_in_95_percent_of_episodes():

@@ -1,0 +1,387 @@
+"""What every registered environment, supervisor and algorithm must do, none of them named here; then the whole loop."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import QUICKLY
+
+import fleetjax
+from fleetjax import HumanState, Signals, envs, priority, supervisors
+from fleetjax.allocation import allocate
+from fleetjax.config import FIELDS
+from fleetjax.physics.base import PhysicsState
+
+NUM_ROBOTS = 8
+NUM_STEPS = 200
+
+each_env = pytest.mark.parametrize("name", fleetjax.list_envs())
+each_supervisor = pytest.mark.parametrize("name", fleetjax.list_supervisors())
+each_algorithm = pytest.mark.parametrize("name", fleetjax.list_algorithms())
+
+
+compiled = functools.partial(jax.jit, compiler_options=QUICKLY)
+
+
+class Suite:
+    """An environment, eight robots that each hold one extreme action, and all states that they pass through."""
+
+    def __init__(self, name: str):
+        self.env = env = envs.make(name)
+        self.robots = jnp.arange(NUM_ROBOTS)
+        self.keys = jax.random.split(jax.random.key(0), NUM_ROBOTS)
+        self.reset = compiled(jax.vmap(env.reset))
+        self.step = compiled(jax.vmap(env.step))
+        self.active = jnp.ones(NUM_ROBOTS, bool)
+        self.start = self.reset(self.keys, self.robots)
+        draws = jax.random.normal(jax.random.key(1), (NUM_ROBOTS, env.spec.action_size))
+        self.action = jax.nn.one_hot(draws.argmax(1), draws.shape[1]) if env.spec.discrete else jnp.sign(draws)
+
+        def hold(state, key):
+            after = jax.vmap(env.step)(state, self.action, self.active, jax.random.split(key, NUM_ROBOTS))
+            return after, after
+
+        scan = compiled(lambda start, keys: jax.lax.scan(hold, start, keys)[1])
+        self.step_keys = jax.random.split(jax.random.key(2), NUM_STEPS)
+        self.states = scan(self.start, self.step_keys)
+
+    def before_violation(self):
+        """Return, for each robot that falls, its state one step before, and what the step needs; others as at step 1."""
+        fall = np.asarray(self.states.violation).argmax(axis=0)
+        assert fall.max() > 0, "no robot violates: hold other actions"
+        last = np.maximum(fall - 1, 0)
+        state = jax.tree.map(lambda x: x[last, np.arange(NUM_ROBOTS)], self.states)
+        keys = jnp.stack([jax.random.split(self.step_keys[last[i] + 1], NUM_ROBOTS)[i] for i in range(NUM_ROBOTS)])
+        return state, keys, fall > 0
+
+
+suite = functools.cache(Suite)
+
+
+def types(tree):
+    return jax.tree.map(lambda x: (x.shape, x.dtype, getattr(x, "weak_type", False)), tree)
+
+
+def assert_same(tree, other):
+    jax.tree.map(np.testing.assert_array_equal, tree, other)
+
+
+def assert_close(tree, other):
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-4), tree, other)
+
+
+# Environments
+
+
+@each_env
+def test_env_keeps_shapes_and_types(name):
+    env = suite(name).env
+    key, action = jax.random.key(0), jax.ShapeDtypeStruct((env.spec.action_size,), jnp.float32)
+    first = jax.eval_shape(env.reset, key, jnp.int32(0))
+    assert types(jax.eval_shape(env.step, first, action, True, key)) == types(first)
+    assert (first.obs.shape, first.obs.dtype) == ((env.spec.observation_size,), jnp.float32)
+    scalars = [(leaf.shape, leaf.dtype) for leaf in first[2:]]
+    assert scalars == [((), jnp.dtype(t)) for t in ("float32", "bool", "bool", "bool", "float32", "int32")]
+    if env.next_goal:
+        assert types(jax.eval_shape(env.next_goal, first, key)) == types(first)
+
+
+@each_env
+def test_env_spec_says_who_it_is(name):
+    spec = suite(name).env.spec
+    assert spec.name == name
+    assert spec.supervisor in fleetjax.list_supervisors()
+    assert spec.control_step > 0
+    assert envs.make(name) is envs.make(name)
+
+
+@each_env
+def test_env_starts_by_key(name):
+    s = suite(name)
+    assert_same(s.reset(s.keys, s.robots), s.start)
+    assert len(np.unique(np.asarray(s.start.obs), axis=0)) == NUM_ROBOTS
+    assert not np.any(s.start.violation | s.start.success | s.start.timeout)
+    assert not np.any(s.start.reward)
+    assert not np.any(s.start.episode_return)
+    assert not np.any(s.start.episode_step)
+
+
+@each_env
+def test_env_steps_by_key(name):
+    s = suite(name)
+    assert_same(s.step(s.start, s.action, s.active, s.keys), s.step(s.start, s.action, s.active, s.keys))
+
+
+@each_env
+def test_env_observes_finite_numbers(name):
+    s = suite(name)
+    assert np.all(np.isfinite(s.start.obs))
+    assert np.all(np.isfinite(s.states.obs))
+    assert np.all(np.isfinite(s.states.reward))
+
+
+@each_env
+def test_env_keeps_the_accounts_of_an_episode(name):
+    s = suite(name)
+    total = np.zeros(NUM_ROBOTS, np.float32)
+    for t in range(NUM_STEPS):
+        total += np.asarray(s.states.reward[t])
+        np.testing.assert_allclose(s.states.episode_return[t], total, rtol=1e-5, atol=1e-5)
+    np.testing.assert_array_equal(s.states.episode_step, np.arange(1, NUM_STEPS + 1)[:, None].repeat(NUM_ROBOTS, 1))
+
+
+@each_env
+def test_env_never_resets_itself(name):
+    """What follows depends on the state alone, not on flags and accounts: an episode that ended just goes on."""
+    s = suite(name)
+    state, keys, falls = s.before_violation()
+    ended = s.step(state, s.action, s.active, keys)
+    assert np.all(ended.violation[falls])
+    ended = ended._replace(timeout=s.active, success=s.active, episode_step=jnp.full(NUM_ROBOTS, s.env.spec.horizon))
+    fresh = envs.begin(ended.physics, ended.obs)
+    unmarked = jax.tree.map(lambda x, like: jnp.broadcast_to(x, like.shape), fresh, ended)
+    one, other = (s.step(x, s.action, s.active, keys) for x in (ended, unmarked))
+    assert_same((one.physics, one.obs, one.reward, one.violation), (other.physics, other.obs, other.reward, other.violation))
+    np.testing.assert_array_equal(one.episode_step, s.env.spec.horizon + 1)
+
+
+@each_env
+def test_env_times_out_at_its_horizon(name):
+    s = suite(name)
+    for steps_left in (2, 1):
+        late = s.start._replace(episode_step=jnp.full(NUM_ROBOTS, s.env.spec.horizon - steps_left))
+        after = s.step(late, s.action, s.active, s.keys)
+        assert not np.any(after.violation)
+        np.testing.assert_array_equal(after.timeout, steps_left == 1)
+
+
+@each_env
+def test_env_violation_beats_success_and_timeout(name):
+    s = suite(name)
+    assert not np.any(s.states.violation & (s.states.success | s.states.timeout))
+    state, keys, falls = s.before_violation()
+    rich = jnp.full(NUM_ROBOTS, 1e9, jnp.float32)
+    late = state._replace(episode_step=jnp.full(NUM_ROBOTS, s.env.spec.horizon - 1), episode_return=rich)
+    after = s.step(late, s.action, s.active, keys)
+    assert np.all(after.violation[falls])
+    assert not np.any(after.violation & (after.success | after.timeout))
+
+
+@each_env
+def test_env_leaves_inactive_robots_alone(name):
+    """They do not touch the others; where a physics backend runs, it does not touch them either."""
+    s = suite(name)
+    half = s.robots % 2 == 0
+    everyone, some = (s.step(s.start, s.action, active, s.keys) for active in (s.active, half))
+    assert_same(jax.tree.map(lambda x: x[half], some), jax.tree.map(lambda x: x[half], everyone))
+    if isinstance(s.start.physics, PhysicsState):
+        assert_same(*(jax.tree.map(lambda x: x[~half], x.physics) for x in (some, s.start)))
+
+
+@each_env
+def test_env_permutes_with_its_robots(name):
+    s = suite(name)
+    order = jax.random.permutation(jax.random.key(3), NUM_ROBOTS)
+    permuted = jax.tree.map(lambda x: x[order], s.start)
+    assert_same(s.reset(s.keys[order], s.robots[order]), permuted)
+    after = s.step(s.start, s.action, s.active, s.keys)
+    assert_same(s.step(permuted, s.action[order], s.active, s.keys[order]), jax.tree.map(lambda x: x[order], after))
+
+
+@each_env
+def test_env_vmapped_is_a_loop_and_jitted_is_not_jitted(name):
+    s = suite(name)
+    middle = jax.tree.map(lambda x: x[20], s.states)
+    after = s.step(middle, s.action, s.active, s.keys)
+    single = compiled(s.env.step)
+    for i in range(NUM_ROBOTS):
+        one = jax.tree.map(lambda x, i=i: x[i], middle)
+        expected = jax.tree.map(lambda x, i=i: x[i], after)
+        assert_close(single(one, s.action[i], s.active[i], s.keys[i]), expected)
+    assert_close(s.env.step(one, s.action[i], s.active[i], s.keys[i]), expected)
+
+
+# Supervisors
+
+
+@each_supervisor
+def test_supervisor_gives_actions(name):
+    serves = [e for e in fleetjax.list_envs() if suite(e).env.spec.supervisor == name]
+    assert serves, "no registered environment has this supervisor by default"
+    for e in serves:
+        s = suite(e)
+        act = compiled(jax.vmap(supervisors.make(name, s.env).act))
+        for state in (s.start, jax.tree.map(lambda x: x[-1], s.states)):
+            action = np.asarray(act(state, s.keys))
+            assert (action.shape, action.dtype) == ((NUM_ROBOTS, s.env.spec.action_size), np.float32)
+            assert np.all(np.isfinite(action))
+            if s.env.spec.discrete:
+                assert np.all((action == 0) | (action == 1))
+                assert np.all(action.sum(axis=1) == 1)
+            assert np.all(np.abs(action) <= 1)
+            assert_same(act(state, s.keys), action)
+
+
+# Algorithms
+
+
+def make_signals(key: jax.Array) -> Signals:
+    """Return plausible signals of 24 robots, of which some are sure, safe, or in violation."""
+    keys = jax.random.split(key, 5)
+    draws = [jnp.maximum(jax.random.uniform(k, (24,), minval=-0.5), 0.0) for k in keys[:3]]
+    return Signals(jax.random.bernoulli(keys[3], 0.3, (24,)), draws[0], draws[1], draws[2], jnp.int32(40))
+
+
+def decide(name, config, signals, aux, key):
+    """Score, then give six humans to the robots."""
+    score, aux = priority.get_algorithm(name).make_priority(config).score(signals, aux, key)
+    humans = HumanState(jnp.full(6, -1, jnp.int32), jnp.zeros(6, jnp.int32))
+    return score, aux, allocate(score, humans, jnp.full(24, 5), key).robot
+
+
+@functools.cache
+def jitted(name):
+    return compiled(functools.partial(decide, name))
+
+
+@pytest.fixture(scope="module")
+def settings():
+    return fleetjax.make_config("navigation", random_threshold=0.4, thrifty_threshold=0.5, initial_period=50)
+
+
+@each_algorithm
+def test_algorithm_scores(name, settings):
+    """f32[N] >= 0; a memory of fixed structure; whoever is helped has a score; jit or not; thresholds do not recompile."""
+    aux = priority.get_algorithm(name).make_priority(settings).init()
+    traced = ("uncertainty_threshold", "risk_threshold", "random_threshold", "thrifty_weight", "thrifty_threshold")
+    halved = settings.replace(**{field: getattr(settings, field) / 2 for field in traced})
+    helped = 0
+    for i, config in enumerate((settings, settings.replace(initial_period=20), halved)):
+        signals, key = make_signals(jax.random.key(i)), jax.random.key(i)
+        score, after, robot = jitted(name)(config, signals, aux, key)
+        assert (score.shape, score.dtype) == ((24,), jnp.float32)
+        assert np.all(score >= 0)
+        assert np.all(np.asarray(score)[robot[robot >= 0]] > 0)
+        assert types(after) == types(aux)
+        helped += np.sum(robot >= 0)
+        aux = after
+    eager, _ = priority.get_algorithm(name).make_priority(halved).score(signals, aux, key)
+    np.testing.assert_allclose(eager, jitted(name)(halved, signals, aux, key)[0], rtol=1e-6)
+    assert helped > 0
+    assert jitted(name)._cache_size() == 1
+
+
+@each_algorithm
+def test_algorithm_gives_no_human_for_nan(name, settings):
+    """Robots of which a signal is no number may get help for another reason, but never because of it."""
+    aux = priority.get_algorithm(name).make_priority(settings).init()
+    for field in ("uncertainty", "risk", "goal"):
+        signals = make_signals(jax.random.key(0))
+        signals = signals._replace(**{field: getattr(signals, field).at[::3].set(jnp.nan)})
+        score, _, robot = jitted(name)(settings, signals, aux, jax.random.key(0))
+        assert np.all(np.nan_to_num(score)[robot[robot >= 0]] > 0)
+        assert len(np.unique(robot[robot >= 0])) == np.sum(robot >= 0)
+
+
+# The whole loop
+
+
+TINY = {
+    "num_robots": 8,
+    "num_humans": 3,
+    "num_steps": 40,
+    "ensemble_size": 2,
+    "hidden_sizes": (8,),
+    "batch_size": 16,
+    "human_capacity": 500,
+    "critic_capacity": 200,
+    "num_demonstrations": 200,
+    "pretraining_steps": 20,
+    "critic_pretraining_steps": 20,
+    "num_critic_transitions": 100,
+    "uncertainty_threshold": 0.01,
+    "hard_reset_time": 3,
+}
+COUNTS = [name for name in fleetjax.Metrics._fields if name not in ("reward", "uncertainty", "policy_loss")]
+
+
+def counts(metrics) -> dict[str, np.ndarray]:
+    return {name: np.asarray(getattr(metrics, name)) for name in COUNTS}
+
+
+@pytest.fixture(scope="module")
+def tiny():
+    return fleetjax.make_config("navigation", "cur", **TINY)
+
+
+@pytest.fixture(scope="module")
+def run():
+    return compiled(fleetjax.run)
+
+
+def test_no_traced_field_recompiles(tiny, run):
+    """Every traced field gets another value, and the compiled program serves both."""
+    before = run(tiny, jax.random.key(0))
+    traced = [name for name, field in FIELDS.items() if field.traced]
+    assert len(traced) >= 20
+    changed = {}
+    for name in traced:
+        value = np.asarray(getattr(tiny, name))
+        if value.dtype == bool:
+            changed[name] = not value
+        elif value.dtype == np.int32:
+            changed[name] = int(value) - 10 if value > 20 else int(value) + 1
+        else:
+            changed[name] = 0.7 * float(value) + 0.01
+    after = run(tiny.replace(**changed), jax.random.key(0))
+    assert run._cache_size() == 1
+    assert np.any(np.asarray(before.metrics.reward) != np.asarray(after.metrics.reward))
+    assert int(after.state.human_data.pairs.added) != int(before.state.human_data.pairs.added)
+
+
+def test_vmap_over_seeds_is_a_loop_over_seeds(tiny, run):
+    """Every count of every timestep is equal to the last one; rewards and losses to rounding."""
+    keys = jax.random.split(jax.random.key(1), 3)
+    together = compiled(jax.vmap(fleetjax.run, in_axes=(None, 0)))(tiny, keys).metrics
+    assert len(np.unique(np.asarray(together.reward), axis=0)) == 3
+    for i, key in enumerate(keys):
+        alone = run(tiny, key).metrics
+        one = jax.tree.map(lambda x, i=i: x[i], together)
+        assert_same(counts(one), counts(alone))
+        np.testing.assert_allclose(one.reward, alone.reward, rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(one.policy_loss, alone.policy_loss, rtol=1e-3, atol=1e-5)
+
+
+def test_loop_jitted_is_not_jitted(tiny, run):
+    """A timestep by `plan` and `advance`, operation by operation, has the counts and the state of the compiled one."""
+    state, key = run(tiny, jax.random.key(2)).state, jax.random.key(3)
+    step = fleetjax.make_fleet(tiny, envs.make("navigation")).step
+    (after, metrics), (expected, expected_metrics) = step(state, key), compiled(step)(state, key)
+    assert_same(counts(metrics), counts(expected_metrics))
+    assert_same(after.humans, expected.humans)
+    assert_close(after, expected)
+
+
+def is_mujoco_robot(name: str) -> bool:
+    state = jax.eval_shape(envs.make(name).reset, jax.random.key(0), jnp.int32(0))
+    return isinstance(state.physics, PhysicsState)
+
+
+@pytest.mark.parametrize("name", [name for name in fleetjax.list_envs() if is_mujoco_robot(name)])
+def test_loop_runs_on_mjx(name):
+    """Demonstrations, pre-training and a few timesteps; a demonstration is cut short, since MJX takes its time on a CPU."""
+    env = envs.make(name, "mjx")
+    short = env._replace(step=jax.jit(env.step), spec=env.spec._replace(horizon=12))
+    config = fleetjax.make_config(name, "uc", **TINY | {"num_steps": 6, "num_demonstrations": 40, "backend": "mjx"})
+    result = compiled(functools.partial(fleetjax.run, env=short))(config, jax.random.key(0))
+    metrics = result.metrics
+    assert np.all(metrics.moving + metrics.idle == TINY["num_robots"])
+    assert metrics.teleop_steps.sum() > 0
+    assert int(result.state.human_data.pairs.size) == 40 + int(metrics.teleop_steps.sum())
+    assert np.all(np.isfinite(metrics.reward))
+    assert np.all(np.isfinite(metrics.policy_loss))
+    assert np.all(np.isfinite(result.state.env.obs))
+    assert not np.any(result.state.env.physics.diverged)
+    np.testing.assert_allclose(result.state.env.physics.time, result.state.env.episode_step * env.spec.control_step, rtol=1e-4)

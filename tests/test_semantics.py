@@ -1,7 +1,5 @@
 """The rules of the loop, 1 to 11, one test or more each; the others are in `test_semantics_learning.py`."""
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,8 +7,8 @@ import pytest
 import toy_envs
 from reference import recording
 from reference.recording import quick_jit
-from reference.scenario import HORIZON, NOBODY, TINY, M, N, T, play, program
-from toy_envs import NEVER
+from reference.scenario import HORIZON, NOBODY, TINY, M, N, T, make_counting_learner, play, program
+from toy_envs import ALWAYS, NEVER
 
 import fleetjax
 from fleetjax.allocation import allocate
@@ -25,27 +23,6 @@ quick_allocate = quick_jit(allocate)
 def toy_supervisors():
     with toy_envs.registered_supervisors():
         yield
-
-
-class Counter(NamedTuple):
-    """An optimizer state that only counts."""
-
-    count: jax.Array  # pyright: ignore[reportIncompatibleMethodOverride]
-
-
-def make_counting_learner(config, spec) -> imitation.Learner:
-    """A policy whose action and uncertainty are the number of pairs that it has seen, by hundreds."""
-
-    def update(state, data, key):
-        seen = data.pairs.size.astype(jnp.float32) / 100
-        return state._replace(params=seen, opt_state=Counter(state.opt_state.count + 1)), seen
-
-    return imitation.Learner(
-        init=lambda key, normalizer: imitation.LearnerState(jnp.zeros(()), Counter(jnp.int32(0)), normalizer),
-        act=lambda state, obs: jnp.broadcast_to(state.params, (*obs.shape[:-1], spec.action_size)),
-        uncertainty=lambda state, obs: jnp.broadcast_to(state.params, obs.shape[:-1]),
-        update=update,
-    )
 
 
 def test_semantic_01_order_of_a_timestep(monkeypatch):
@@ -126,9 +103,17 @@ def test_semantic_05_humans_stay_with_robots_chosen_again_and_others_go_in_order
     assert new.duration.tolist() == [0, 6, 0]
 
 
-def test_semantic_05_nan_is_zero_and_humans_left_over_are_free():
+def test_semantic_05_a_nan_score_counts_as_zero():
+    human = HumanState(jnp.array([-1]), jnp.array([0]))
+    new = quick_allocate(jnp.array([jnp.nan, 0.5, 1.0]), human, jnp.full(3, 5), jax.random.key(0))
+    assert new.robot.tolist() == [2]
+    new = quick_allocate(jnp.array([jnp.nan, 0.0, 0.0]), human, jnp.full(3, 5), jax.random.key(0))
+    assert new.robot.tolist() == [-1]
+
+
+def test_semantic_05_humans_left_over_are_free():
     humans = HumanState(jnp.array([0, -1]), jnp.array([9, 0]))
-    new = quick_allocate(jnp.array([jnp.nan, 1.0, 0.0]), humans, jnp.full(3, 5), jax.random.key(0))
+    new = quick_allocate(jnp.array([0.0, 1.0, 0.0]), humans, jnp.full(3, 5), jax.random.key(0))
     assert new.robot.tolist() == [1, -1]
 
 
@@ -191,6 +176,13 @@ def test_semantic_08_a_hard_reset_takes_exactly_its_time(t_R):
     # It does not move until it is drawn anew from its own initial distribution p_i^0.
     assert trace.env.obs[:t_R, 1].tolist() == [[1, 1, 0]] * t_R
     assert trace.env.obs[t_R, 1].tolist() == [1, 0, 0]
+
+
+def test_semantic_08_a_robot_drawn_into_a_violation_needs_another_whole_reset():
+    trace = play([[1, 0, 0, 0]], falls_at=[ALWAYS, NEVER, NEVER, NEVER], t_T=1, t_R=3)
+    assert trace.metrics.hard_resets.tolist() == [0, 0, 1] * 4
+    assert trace.plan.humans.duration[:, 0].tolist() == [0, 1, 2] * 4
+    assert trace.plan.resetting[:, 0].all()
 
 
 def test_semantic_08_times_are_traced():

@@ -188,6 +188,7 @@ def test_semantic_18_every_member_resamples_all_pairs_so_far_for_each_new_pair()
     so_far = 3 * (np.arange(size) // 3 + 1)
     assert np.all((resample[:, :size] >= 0) & (resample[:, :size] < so_far))
     assert not resample[:, size:].any()
+    assert np.any(resample[:, 3:size] >= so_far[3:] - 3)  # the new pairs are among them
     quantile = (resample[:, :size] + 0.5) / so_far
     assert np.all(np.abs(quantile.mean(axis=1) - 0.5) < 4 / np.sqrt(12 * size))  # uniform
     assert np.all(np.abs(np.corrcoef(quantile) - np.eye(members)) < 4 / np.sqrt(size))  # each its own

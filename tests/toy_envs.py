@@ -13,7 +13,7 @@ from fleetjax import supervisors
 from fleetjax.envs import Env, EnvSpec, begin, proceed
 from fleetjax.types import EnvState
 
-NEVER = 0
+NEVER, ALWAYS = 0, -1
 BOARD = 5  # cells a side of the grid
 MOVES = ((1, 0), (-1, 0), (0, 1), (0, -1))  # cells, one for each discrete action
 
@@ -24,7 +24,7 @@ def scripted(falls_at, succeeds_at, *, horizon: int = 1000, new_goals: bool = Fa
     Observation f32[3]: the robot i, steps since the reset, goals reached. One action; it does nothing but give the reward.
 
     Args:
-        falls_at: i32[N] the episode step that violates the constraint, `NEVER` = none.
+        falls_at: i32[N] the episode step that violates the constraint, `NEVER` = none, `ALWAYS` = the first state does.
         succeeds_at: i32[N] the episode step, and all its multiples, that succeed, `NEVER` = none.
         horizon: control steps in an episode.
         new_goals: whether a success brings a new goal and the episode goes on.
@@ -37,7 +37,7 @@ def scripted(falls_at, succeeds_at, *, horizon: int = 1000, new_goals: bool = Fa
     def reset(key: jax.Array, robot: jax.Array) -> EnvState:
         del key
         physics = {"robot": robot.astype(jnp.int32), "clock": jnp.int32(0), "goal": jnp.int32(0)}
-        return begin(physics, observe(physics))
+        return begin(physics, observe(physics))._replace(violation=falls_at[robot] == ALWAYS)
 
     def step(state: EnvState, action: jax.Array, active: jax.Array, key: jax.Array) -> EnvState:
         del active, key

@@ -2,15 +2,17 @@
 
 import functools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy_envs
 
 import fleetjax
 from fleetjax import priority
+from fleetjax.learning import imitation
 from fleetjax.priority import Algorithm, Priority
 from reference import recording
 from reference.recording import quick_jit
@@ -46,3 +48,24 @@ def play(
     timing = {"min_teleop_time": t_T, "hard_reset_time": t_R}
     trace = program(**static)(table, np.array(falls_at), np.array(succeeds_at), timing, silence)
     return jax.tree.map(np.asarray, trace)
+
+
+class Counter(NamedTuple):
+    """An optimizer state that only counts."""
+
+    count: jax.Array  # pyright: ignore[reportIncompatibleMethodOverride]
+
+
+def make_counting_learner(config, spec) -> imitation.Learner:
+    """A policy whose action and uncertainty are the number of pairs that it has seen, by hundreds."""
+
+    def update(state, data, key):
+        seen = data.pairs.size.astype(jnp.float32) / 100
+        return state._replace(params=seen, opt_state=Counter(state.opt_state.count + 1)), seen
+
+    return imitation.Learner(
+        init=lambda key, normalizer: imitation.LearnerState(jnp.zeros(()), Counter(jnp.int32(0)), normalizer),
+        act=lambda state, obs: jnp.broadcast_to(state.params, (*obs.shape[:-1], spec.action_size)),
+        uncertainty=lambda state, obs: jnp.broadcast_to(state.params, obs.shape[:-1]),
+        update=update,
+    )

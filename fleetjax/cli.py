@@ -38,14 +38,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         arguments = flags.parse(sys.argv[1:] if argv is None else argv)
         commands[arguments.command](arguments)
-    except Refusal as error:
-        say(f"fleetjax: {_one_line(error)}")
-        return 2
-    except OSError as error:
+    except (Refusal, OSError) as error:
         say(f"fleetjax: {_one_line(error)}")
         return 2
     except KeyboardInterrupt as interrupt:
-        say(f"fleetjax: interrupted{_one_line(interrupt)}")
+        say(" ".join(["fleetjax: interrupted", *interrupt.args]))
         if argv is None:  # a computation that still runs would hold the process until it ends
             sys.stdout.flush()
             os._exit(INTERRUPTED)
@@ -108,10 +105,10 @@ def _keep(path: Path, config: Config, seed: int, chunks: list[Metrics]) -> str:
     """Save what an interrupted run has; return what there is to say about it."""
     if not chunks:
         folder.discard(path)
-        return " before the first timestep; nothing was kept"
+        return "before the first timestep; nothing was kept"
     metrics = execution.join(chunks)
     _save(path, config, seed, metrics)
-    return f" after {len(metrics.successes)} of {config.num_steps} timesteps; their metrics and figure are in {path}"
+    return f"after {len(metrics.successes)} of {config.num_steps} timesteps; their metrics and figure are in {path}"
 
 
 def _save(path: Path, config: Config, seed: int, metrics: Metrics) -> None:
@@ -138,8 +135,7 @@ def _list(arguments: argparse.Namespace) -> None:
     print("\nalgorithms")
     named = [name for name in list_algorithms() if not text.is_order(name) or name == "cur"]
     print(text.table([("", name, text.label(name), text.meaning(name)) for name in named]))
-    orders = [name for name in list_algorithms() if text.is_order(name) and name != "cur"]
-    print(f"  and {', '.join(orders)}: {text.LETTERS}")
+    print(f"  and {text.ORDERS}")
 
 
 def _plot(arguments: argparse.Namespace) -> None:
@@ -150,7 +146,14 @@ def _plot(arguments: argparse.Namespace) -> None:
         runs = [folder.read_run(path) for path in arguments.runs]
         data = [(run.config, run.seed, folder.read_metrics(run)) for run in runs]
     folder.check_free(arguments.output, overwrite=arguments.overwrite)
-    drawn = figure.draw(figure.group(data))
+    groups = figure.group(data)
+    for run, (_, _, metrics) in zip(runs, data, strict=True):
+        if len(metrics.successes) < run.config.num_steps:
+            say(f"{run.folder} was interrupted; the curves of its kind end at {len(metrics.successes)} timesteps")
+    left_out = len(data) - sum(len(curves.values) for curves in groups)
+    if left_out:
+        say(f"{text.plural(left_out, 'run')} left out: same settings and seed as a later one")
+    drawn = figure.draw(groups)
     folder.write(arguments.output, figure.render(drawn, arguments.output.suffix))
     print(arguments.output)
 

@@ -9,6 +9,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from fleetjax.config import Config
@@ -56,11 +57,13 @@ class Curves(NamedTuple):
     Attributes:
         label: its name in the legend.
         algorithm: gives the colour.
+        environment: where it was run.
         values: f64[S, 4, T] the panels' curves, for each seed.
     """
 
     label: str
     algorithm: str
+    environment: str
     values: np.ndarray
 
 
@@ -90,7 +93,7 @@ def group(runs: Sequence[tuple[Config, int, Metrics]]) -> list[Curves]:
     for (key, seeds), name in zip(groups.items(), labels, strict=True):
         length = min(len(metrics.successes) for metrics in seeds.values())
         values = np.stack([curves_of(metrics, configs[key])[:, :length] for metrics in seeds.values()])
-        result.append(Curves(name, configs[key].algorithm, values))
+        result.append(Curves(name, configs[key].algorithm, configs[key].environment, values))
     return result
 
 
@@ -117,8 +120,7 @@ def draw(groups: Sequence[Curves], title: str = "") -> Figure:
         title: takes the place of the legend.
     """
     with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(12.5, 3.2), layout="constrained")
-        figure.get_layout_engine().set(w_pad=0.12)  # pyright: ignore[reportOptionalMemberAccess]
+        figure = Figure(figsize=(12.5, 3.1), layout=ConstrainedLayoutEngine(w_pad=0.12))
         axes = figure.subplots(1, len(PANELS))
         styles = _styles([curves.algorithm for curves in groups])
         labels = [curves.label for curves in groups]
@@ -139,15 +141,19 @@ def draw(groups: Sequence[Curves], title: str = "") -> Figure:
             figure.suptitle(title, x=0.008, ha="left", fontsize=11)
         else:
             columns = max(1, min(len(labels), _LEGEND_WIDTH // (7 + max(map(len, labels)))))
-            figure.legend(axes[0].get_lines(), labels, loc="outside upper left", ncols=columns, alignment="left", title=_note(groups))
+            figure.legend(
+                axes[0].get_lines(), labels, loc="outside upper left", ncols=columns, alignment="left", title=_note(groups)
+            )
+            figure.set_figheight(3.1 + 0.24 * -(-len(labels) // columns))
     return figure
 
 
-def _note(groups: Sequence[Curves]) -> str | None:
-    """Return what lines and bands are, where there are several seeds."""
+def _note(groups: Sequence[Curves]) -> str:
+    """Return where the fleets ran, and what lines and bands are where there are several seeds."""
+    places = ", ".join(dict.fromkeys(curves.environment for curves in groups))
     seeds = {len(curves.values) for curves in groups}
     number = f" of {max(seeds)} seeds" if len(seeds) == 1 else ""
-    return f"mean{number}, band of one standard deviation" if max(seeds) > 1 else None
+    return f"{places}: mean{number}, band of one standard deviation" if max(seeds) > 1 else places
 
 
 def _prepare_axes(ax: Axes, name: str) -> None:

@@ -2,6 +2,7 @@
 
 import argparse
 import difflib
+import functools
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -38,7 +39,8 @@ class _Parser(argparse.ArgumentParser):
     """Refuses in one line, with the closest flag, where argparse would print its usage."""
 
     def __init__(self, **options: Any):
-        super().__init__(allow_abbrev=False, formatter_class=_Format, **options)
+        layout = functools.partial(argparse.RawDescriptionHelpFormatter, max_help_position=30)
+        super().__init__(allow_abbrev=False, formatter_class=layout, **options)
 
     def error(self, message: str) -> NoReturn:
         raise Refusal(message)
@@ -56,11 +58,6 @@ class _Parser(argparse.ArgumentParser):
         flag = flags[0].split("=")[0]
         close = difflib.get_close_matches(flag, list(self._option_string_actions), n=1, cutoff=0.0)
         return f"unknown flag {flag}; the closest is {close[0]}"
-
-
-class _Format(argparse.RawDescriptionHelpFormatter):
-    def __init__(self, prog: str):
-        super().__init__(prog, max_help_position=30)
 
 
 def parse(argv: Sequence[str]) -> argparse.Namespace:

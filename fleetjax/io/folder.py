@@ -246,13 +246,14 @@ def read_policy(run: Run) -> LearnerState:
         ValueError: if the file is missing, damaged or does not fit the configuration.
     """
     with _blame(run.folder / POLICY):
-        learner = make_learner(run.config, envs.make(run.config.environment, run.config.backend).spec)
-        size = envs.make(run.config.environment, run.config.backend).spec.observation_size
-        template = learner.init(jax.random.key(0), Normalizer(jnp.zeros(size), jnp.ones(size)))
+        spec = envs.make(run.config.environment, run.config.backend).spec
+        entries = jnp.zeros(spec.observation_size)
+        shapes = jax.eval_shape(make_learner(run.config, spec).init, jax.random.key(0), Normalizer(entries, entries))
+        template = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
         stored = serialization.from_bytes(_policy(template), _read_data(run, POLICY))
         wanted, found = jax.tree.leaves(_policy(template)), jax.tree.leaves(stored)
         pairs = zip(wanted, found, strict=True)
         same = all(isinstance(b, np.ndarray) and (a.shape, a.dtype) == (b.shape, b.dtype) for a, b in pairs)
         _expect(same, "its arrays do not have the shapes that config.json asks for")
         _expect(all(np.all(np.isfinite(x)) for x in found), "it holds numbers that are not finite")
-        return template._replace(**jax.tree.map(jnp.asarray, stored))
+        return jax.tree.map(jnp.asarray, template._replace(**stored))

@@ -20,7 +20,7 @@ _KNOWN = {
     "expert": ("Expert", "every robot is teleoperated and nothing is learnt: the upper bound"),
     "cur": ("C.U.R.", "robots in violation first, then by uncertainty, then by risk: the paper's proposal"),
 }
-LETTERS = "any order of distinct letters out of c (violation), u (uncertainty), r (risk), first letter first"
+ORDERS = "any order of distinct letters out of c (violation), u (uncertainty) and r (risk), such as uc: the first comes first"
 
 
 def is_order(algorithm: str) -> bool:

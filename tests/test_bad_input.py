@@ -1,0 +1,73 @@
+"""Parameters and commands that cannot be used cost one line on stderr and exit code 2, and touch nothing."""
+
+import pytest
+from commands import contents, refused
+
+from fleetjax.io import folder
+
+RUN = ("run", "navigation")
+BAD_RUNS = {
+    "M > N": ((*RUN, "--num-robots", 4, "--num-humans", 5), "num_humans = 5 is more than num_robots = 4"),
+    "T < 1": ((*RUN, "--num-steps", 0), "num_steps = 0 must be at least 1"),
+    "T no integer": ((*RUN, "--num-steps", 2.5), "--num-steps: 2.5 must be a whole number"),
+    "t_T no integer": ((*RUN, "--min-teleop-time", 0.5), "--min-teleop-time: 0.5 must be a whole number"),
+    "t_R no integer": ((*RUN, "--hard-reset-time", "nan"), "--hard-reset-time: nan must be a whole number"),
+    "t_I too large": ((*RUN, "--initial-period", 1e12), "must be a whole number, at most 2147483647"),
+    "t_R < 1": ((*RUN, "--hard-reset-time", 0), "hard_reset_time = 0 must be at least 1"),
+    "environment": (("run", "navigatoin"), "environment = 'navigatoin' is unknown; the closest are navigation"),
+    "algorithm": ((*RUN, "--algorithm", "ensemble"), "algorithm = 'ensemble' is unknown; the closest are ensemble_dagger"),
+    "backend": ((*RUN, "--backend", "cuda"), "backend = 'cuda' is unknown"),
+    "supervisor": ((*RUN, "--supervisor", "humanoyd"), "the closest are humanoid"),
+    "flag": ((*RUN, "--num-robot", 4), "unknown flag --num-robot; the closest is --num-robots"),
+    "flag before": (("run", "--num-robot", 4, "navigation"), "unknown flag --num-robot; the closest is --num-robots"),
+    "flag with =": ((*RUN, "--hard-reset=4"), "unknown flag --hard-reset; the closest is --hard-reset-time"),
+    "too much": ((*RUN, "humanoid"), "unexpected argument 'humanoid'"),
+    "no value": ((*RUN, "--num-robots"), "--num-robots: expected one argument"),
+    "no environment": (("run",), "required: ENV"),
+    "no goal": (("run", "humanoid", "--algorithm", "thrifty_dagger"), "algorithm = 'thrifty_dagger' needs a goal"),
+    "negative uncertainty": ((*RUN, "--uncertainty-threshold", -0.1), "uncertainty_threshold = -0.1"),
+    "negative risk": ((*RUN, "--risk-threshold", "-.5"), "risk_threshold = -0.5 must be in [0, 1]"),
+    "negative random": ((*RUN, "--random-threshold", -1), "random_threshold = -1.0 must be in [0, 1]"),
+    "negative thrifty": ((*RUN, "--thrifty-threshold=-1e-3"), "thrifty_threshold = -0.001"),
+    "not finite": ((*RUN, "--learning-rate", "inf"), "learning_rate = inf must be at least 0"),
+    "no number": ((*RUN, "--learning-rate", "fast"), "--learning-rate: 'fast' must be a number"),
+    "batch": ((*RUN, "--batch-size", 600), "batch_size = 600 is larger than the data"),
+    "no layers": ((*RUN, "--hidden-sizes", 0), "hidden_sizes = (0,)"),
+    "seed": ((*RUN, "--seed", -1), "--seed: '-1' must be a whole number from 0 to 4294967295"),
+    "large seed": ((*RUN, "--seed", 2**32), "--seed: '4294967296' must be a whole number"),
+    "few humans for expert": ((*RUN, "--algorithm", "expert", "--num-humans", 3), "must equal num_robots"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_RUNS)
+def test_bad_parameters_cost_one_line_and_touch_nothing(name, capsys, tmp_path):
+    arguments, reason = BAD_RUNS[name]
+    (tmp_path / "metrics.csv").write_text("precious")
+    place = ("--output", tmp_path, "--overwrite")
+    # The flags come first where a value or a name must stay last.
+    line = refused(capsys, arguments[0], *place, *arguments[1:])
+    assert reason in line
+    assert line.startswith("fleetjax: ")
+    assert contents(tmp_path) == {"metrics.csv": b"precious"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (("rnu", "navigation"), "command = 'rnu' is unknown; the closest are run"),
+        (("--verbose",), "unknown flag --verbose; the closest is --version"),
+        (("plot",), "required: RUN"),
+        (("plot", "nowhere"), "nowhere is not a run folder"),
+        (("plot", "nowhere", "--output", "figure.gif"), "figure.gif must end in one of .png, .pdf, .svg"),
+        (("evaluate", "nowhere", "--num-step", "3"), "unknown flag --num-step; the closest is --num-steps"),
+        (("evaluate", __file__), "it is a file"),
+        (("list", "all"), "unexpected argument 'all'"),
+    ],
+)
+def test_other_commands_refuse_in_one_line(arguments, reason, capsys):
+    assert reason in refused(capsys, *arguments)
+
+
+def test_a_disk_that_fails_costs_one_line(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(folder.os, "fsync", lambda descriptor: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    assert refused(capsys, *RUN, "--output", tmp_path / "run") == "fleetjax: No space left on device\n"

@@ -1,0 +1,243 @@
+"""The command line: what it prints and writes, and that its chunks change nothing."""
+
+import contextlib
+import json
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pandas as pd
+import pytest
+from commands import contents, refused
+
+import fleetjax
+from fleetjax import cli
+from fleetjax.io import folder
+
+STEPS = 120  # chunks of two
+TINY = [
+    *("--num-robots", "4", "--num-humans", "2", "--num-steps", str(STEPS), "--hard-reset-time", "2", "--initial-period", "9"),
+    *("--hidden-sizes", "8", "--ensemble-size", "2", "--batch-size", "8", "--critic-capacity", "300"),
+    *("--num-demonstrations", "20", "--pretraining-steps", "5"),
+    *("--num-critic-transitions", "20", "--critic-pretraining-steps", "5"),
+]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """The folder of a finished run; whoever changes it takes a copy."""
+    path = tmp_path_factory.mktemp("runs") / "finished"
+    assert cli.main(["run", "navigation", *TINY, "--seed", "3", "--output", str(path)]) == 0
+    return path
+
+
+@pytest.fixture
+def copied(finished, tmp_path):
+    return Path(shutil.copytree(finished, tmp_path / "copy"))
+
+
+def test_a_run_folder_holds_all_that_was_asked_for(finished):
+    assert set(contents(finished)) == {"config.json", "metrics.csv", "figure.png", "policy.msgpack"}
+    config = folder.read_run(finished).config
+    assert (config.num_robots, config.num_humans, config.hidden_sizes, int(config.hard_reset_time)) == (4, 2, (8,), 2)
+    assert len(pd.read_csv(finished / "metrics.csv")) == STEPS
+
+
+def test_chunks_give_the_run_that_the_library_gives(finished):
+    run = folder.read_run(finished)
+    whole = jax.jit(fleetjax.run)(run.config, jax.random.key(3))
+    assert np.sum(whole.metrics.hard_resets) > 0
+    assert np.sum(whole.metrics.teleop_steps) > 0
+    for name, chunked, expected in zip(fleetjax.Metrics._fields, folder.read_metrics(run), whole.metrics, strict=True):
+        if name in folder.REALS:
+            np.testing.assert_allclose(chunked, expected, rtol=1e-4, atol=1e-5, err_msg=name)
+        else:
+            np.testing.assert_array_equal(chunked, expected, err_msg=name)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5),
+        folder.read_policy(run).params,
+        whole.state.learner.params,
+    )
+
+
+def test_the_same_seed_gives_the_same_files_and_a_table(finished, copied, capsys):
+    assert cli.main(["run", "navigation", *TINY, "--seed", "3", "--output", str(copied), "--overwrite"]) == 0
+    printed = capsys.readouterr()
+    metrics = folder.read_metrics(folder.read_run(finished))
+    for name in ("successes", "violations", "hard resets", "idle time", "human time", "switches", "decided by risk", "ROHE"):
+        assert f"\n{name} " in printed.out
+    assert ["human", "time", str(metrics.human_steps.sum())] in [line.split()[:3] for line in printed.out.splitlines()]
+    assert str(copied) in printed.out
+    assert "compiling and pre-training" in printed.err.splitlines()[0]
+    assert printed.err.splitlines()[-1].startswith("100% ")
+    for name in ("metrics.csv", "policy.msgpack", "figure.png"):
+        assert (copied / name).read_bytes() == (finished / name).read_bytes()
+
+
+def test_default_folders_are_made_below_runs_and_never_used_again(finished, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(folder.time, "strftime", lambda form: "now")
+    for seed in (3, 4, 4):
+        assert cli.main(["run", "navigation", *TINY, "--seed", str(seed)]) == 0
+    names = ["navigation-cur-seed3-now", "navigation-cur-seed4-now", "navigation-cur-seed4-now-2"]
+    assert sorted(path.name for path in Path("runs").iterdir()) == names
+    same, other = ((Path("runs") / name / "metrics.csv").read_bytes() for name in names[:2])
+    assert same == (finished / "metrics.csv").read_bytes() != other
+    capsys.readouterr()
+    assert cli.main(["plot", *(f"runs/{name}" for name in names), "--output", "all.svg"]) == 0
+    printed = capsys.readouterr()
+    assert printed.out == "all.svg\n"
+    assert printed.err == "1 run left out: same settings and seed as a later one\n"
+    assert "mean of 2 seeds" in Path("all.svg").read_text()
+
+
+def stop_after(chunks: int):
+    """Return progress that is interrupted in the given chunk."""
+
+    @contextlib.contextmanager
+    def progress(config):
+        shown = iter(range(chunks - 1))
+
+        def show(metrics):
+            if next(shown, None) is None:
+                raise KeyboardInterrupt
+
+        yield show
+
+    return progress
+
+
+def test_an_interrupted_run_keeps_its_metrics(finished, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(cli, "progress", stop_after(5))
+    path = tmp_path / "stopped"
+    assert cli.main(["run", "navigation", *TINY, "--seed", "3", "--output", str(path)]) == 130
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line == f"fleetjax: interrupted after 10 of 120 timesteps; their metrics and figure are in {path}"
+    assert set(contents(path)) == {"config.json", "metrics.csv", "figure.png"}
+    kept, whole = ((p / "metrics.csv").read_text().splitlines() for p in (path, finished))
+    assert kept == whole[:11]
+    assert "policy.msgpack is missing" in refused(capsys, "evaluate", path)
+    assert cli.main(["plot", str(path), "--output", str(tmp_path / "figure.pdf")]) == 0
+    assert "was interrupted; the curves of its kind end at 10 timesteps" in capsys.readouterr().err
+
+
+def test_ctrl_c_before_the_first_timestep_leaves_nothing(tmp_path):
+    command = [sys.executable, "-m", "fleetjax", "run", "navigation", "--output", str(tmp_path / "new" / "run")]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    assert "compiling and pre-training" in process.stderr.readline()
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate()
+    assert (process.returncode, out) == (130, "")
+    assert err == "fleetjax: interrupted before the first timestep; nothing was kept\n"
+    assert not (tmp_path / "new" / "run").exists()
+
+
+def test_evaluation_is_the_librarys(copied, capsys):
+    assert cli.main(["evaluate", str(copied), "--num-steps", "16", "--seed", "9"]) == 0
+    printed = capsys.readouterr()
+    run = folder.read_run(copied)
+    config = run.config.replace(num_steps=16)
+    expected = jax.jit(fleetjax.evaluate)(config, jax.random.key(9), folder.read_policy(run)).metrics
+    stored = json.loads((copied / "evaluation.json").read_text())
+    assert (stored["num_steps"], stored["seed"]) == (16, 9)
+    for name in ("successes", "violations", "hard_resets", "idle", "human_steps", "moving"):
+        assert stored["totals"][name] == np.sum(getattr(expected, name)), name
+    totals = [str(np.sum(x)) for x in (expected.successes, expected.violations, expected.idle)]
+    assert printed.out.splitlines()[-1].split() == ["C.U.R.", *totals]
+    assert "ROHE" not in printed.err
+    before = contents(copied)
+    assert "evaluation.json exists already" in refused(capsys, "evaluate", copied)
+    assert contents(copied) == before
+    assert cli.main(["evaluate", str(copied), "--num-steps", "16", "--overwrite"]) == 0
+    assert json.loads((copied / "evaluation.json").read_text())["seed"] == 4  # not the training's 3
+
+
+RUN = ("run", "navigation")
+
+
+def test_existing_folders_and_files_are_not_overwritten(copied, tmp_path, capsys):
+    before = contents(copied)
+    assert "exists already" in refused(capsys, *RUN, *TINY, "--output", copied)
+    file = tmp_path / "figure.png"
+    file.write_text("precious")
+    assert "exists already" in refused(capsys, *RUN, "--output", file)
+    assert "exists already" in refused(capsys, "plot", copied, "--output", file)
+    assert "File exists" in refused(capsys, *RUN, "--output", file, "--overwrite")
+    assert file.read_text() == "precious"
+    assert contents(copied) == before
+
+
+def test_damaged_runs_and_impossible_evaluations_are_refused(copied, capsys, tmp_path):
+    assert "num_steps = 0 must be at least 1" in refused(capsys, "evaluate", copied, "--num-steps", 0)
+    policy = copied / "policy.msgpack"
+    data = bytearray(policy.read_bytes())
+    data[len(data) // 2] ^= 4
+    policy.write_bytes(data)
+    assert "SHA-256" in refused(capsys, "evaluate", copied)
+    assert "evaluation.json" not in contents(copied)
+    config = fleetjax.make_config("navigation", "expert", num_robots=2)
+    folder.create(tmp_path / "expert", config, 0, overwrite=False)
+    assert "trains no policy" in refused(capsys, "evaluate", tmp_path / "expert")
+    (copied / "config.json").write_text("{}")
+    for command in ("plot", "evaluate"):
+        assert f"{copied / 'config.json'} cannot be used" in refused(capsys, command, copied)
+
+
+def help_of(capsys, *arguments: str) -> str:
+    with pytest.raises(SystemExit) as stop:
+        cli.main(arguments)
+    assert stop.value.code == 0
+    return " ".join(capsys.readouterr().out.split())
+
+
+def test_help_tells_every_parameter_with_meaning_unit_and_default(capsys):
+    shown = help_of(capsys, "run", "--help")
+    for name, field in fleetjax.config.FIELDS.items():
+        if name != "environment":
+            assert f"--{name.replace('_', '-')}" in shown
+            assert f"{field.help}{f' ({field.unit})' if field.unit else ''} [default: " in shown
+    assert "operation time T (timesteps) [default: 10000; navigation 2000]" in shown
+    assert "units of the hidden layers of policy and critics [default: 256 256; navigation 64 64]" in shown
+    assert "--no-normalize-observations" in shown
+
+
+def test_help_of_an_environment_tells_its_defaults(capsys):
+    shown = help_of(capsys, "run", "navigation", "--help")
+    assert "parameters (defaults of navigation)" in shown
+    assert "operation time T (timesteps) [default: 2000]" in shown
+
+
+def test_help_and_version_greet(capsys):
+    assert "fleetjax run humanoid" in help_of(capsys)
+    for command in ("run", "list", "plot", "evaluate"):
+        assert f" {command} " in help_of(capsys, "--help")
+    assert help_of(capsys, "--version") == f"fleetjax {fleetjax.__version__}"
+
+
+def test_list_shows_environments_and_algorithms(capsys):
+    assert cli.main(["list"]) == 0
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["humanoid", "108", "21", "999", "no"] in [line[:4] + line[6:] for line in lines]
+    assert ["navigation", "8", "2", "250", "100.0", "ms", "yes"] in lines
+    for name in ("constraint", "random", "ensemble_dagger", "thrifty_dagger", "expert", "cur"):
+        assert any(line[:1] == [name] for line in lines)
+    assert lines[-1][:4] == ["and", "any", "order", "of"]
+
+
+def test_parameters_arrive_as_they_are_typed(monkeypatch, tmp_path):
+    made = []
+    monkeypatch.setattr(cli.folder, "create", lambda path, config, seed, overwrite: made.append((config, seed)))
+    monkeypatch.setattr(cli, "_operate", lambda *arguments: (_ for _ in ()).throw(OSError("stop here")))
+    flags = ["--hidden-sizes", "16", "8", "--no-normalize-observations", "--num-steps", "1e3", "--risk-threshold", ".25"]
+    fleet = ["--algorithm", "expert", "--num-robots", "7", "--backend", "native"]
+    assert cli.main(["run", "navigation", *fleet, "--seed", "4294967295", *flags]) == 2
+    (config, seed), *_ = made
+    assert (config.hidden_sizes, config.num_steps, config.backend) == ((16, 8), 1000, "native")
+    assert (config.num_robots, config.num_humans, seed) == (7, 7, 2**32 - 1)
+    assert not config.normalize_observations
+    assert config.risk_threshold == 0.25

@@ -1,0 +1,121 @@
+"""What people see: curves, tables and progress."""
+
+import io
+import sys
+
+import numpy as np
+import pytest
+from commands import make_metrics
+
+import fleetjax
+from fleetjax.io import figure, text
+from fleetjax.io.progress import progress
+from fleetjax.metrics import Metrics
+
+STEPS = 40
+
+
+@pytest.fixture
+def config():
+    return fleetjax.make_config("navigation", num_steps=STEPS, hidden_sizes=(8,), uncertainty_threshold=0.07)
+
+
+def test_curves_are_the_papers(config):
+    metrics = make_metrics()
+    curves = figure.curves_of(metrics, config)
+    np.testing.assert_array_equal(curves[0], np.cumsum(metrics.successes))
+    np.testing.assert_array_equal(curves[1], np.cumsum(metrics.violations))
+    np.testing.assert_array_equal(curves[2], np.cumsum(metrics.idle))
+    human_time = np.cumsum(metrics.human_steps)
+    expected = 10 / 100 * np.cumsum(metrics.successes) / (1 + human_time / 100)
+    np.testing.assert_allclose(curves[3], expected, rtol=1e-6)
+    assert text.rohe_of(text.add_up(metrics), config) == pytest.approx(expected[-1], rel=1e-6)
+
+
+def test_seeds_become_one_line_and_settings_another(config):
+    other = config.replace(num_humans=5)
+    runs = [(config, 0, make_metrics(0)), (other, 0, make_metrics(1)), (config, 1, make_metrics(2, steps=30))]
+    runs += [(config, 0, make_metrics(3)), (fleetjax.make_config("navigation", "uc"), 0, make_metrics(4))]
+    groups = figure.group(runs)
+    assert [curves.label for curves in groups] == ["C.U.R., num_humans 10", "C.U.R., num_humans 5", "U.C."]
+    assert groups[0].values.shape == (2, 4, 30)  # the shortest seed's timesteps; a seed that comes twice counts once
+    np.testing.assert_array_equal(groups[0].values[0, 0], np.cumsum(make_metrics(3).successes)[:30])
+
+
+def test_the_band_is_one_standard_deviation_about_the_mean(config):
+    runs = [(config, seed, make_metrics(seed)) for seed in range(3)]
+    axes = figure.draw(figure.group(runs)).axes
+    successes = np.array([np.cumsum(make_metrics(seed).successes) for seed in range(3)])
+    mean, deviation = successes.mean(axis=0), successes.std(axis=0, ddof=1)
+    np.testing.assert_allclose(axes[0].lines[0].get_ydata(), mean)
+    band = axes[0].collections[0].get_paths()[0].vertices
+    assert band[:, 1].max() == pytest.approx((mean + deviation).max())
+    assert [ax.get_title(loc="left") for ax in axes] == list(figure.PANELS)
+
+
+def test_every_line_of_a_figure_can_be_told_apart(config):
+    names = ["cur", "constraint", "random", "ensemble_dagger", "thrifty_dagger", "uc", "c", "u", "r"]
+    runs = [(fleetjax.make_config("navigation", name), 0, make_metrics()) for name in names]
+    runs += [(config.replace(num_humans=m), 0, make_metrics()) for m in (2, 3, 4)]
+    lines = figure.draw(figure.group(runs)).axes[0].lines
+    assert len({(line.get_color(), str(line._dash_pattern)) for line in lines}) == len(runs)
+
+
+@pytest.mark.parametrize("suffix", figure.FORMATS)
+def test_figures_come_in_every_format(config, suffix):
+    data = figure.render(figure.draw(figure.group([(config, 0, make_metrics())]), "one run"), suffix)
+    assert data[:8].startswith({".png": b"\x89PNG", ".pdf": b"%PDF", ".svg": b"<?xml"}[suffix])
+
+
+def halves(metrics):
+    return [Metrics(*(x[part] for x in metrics)) for part in (slice(0, 20), slice(20, 40))]
+
+
+def test_progress_without_a_terminal_is_a_few_lines(config, capsys):
+    metrics = make_metrics()
+    with progress(config) as show:
+        for t in range(STEPS):
+            show(Metrics(*(x[t : t + 1] for x in metrics)))
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 10
+    assert lines[4].startswith(" 50% ")
+    assert f"{metrics.successes[:20].sum()} successes, {metrics.violations[:20].sum()} violations" in lines[4]
+    assert f"{metrics.human_steps[19]} humans busy, {metrics.idle[19]} idle" in lines[4]
+    assert f"ROHE {text.rohe_of(text.add_up(metrics), config):.3f}" in lines[-1]
+    assert "steps/s" in lines[-1]
+    assert "left" in lines[-1]
+
+
+def test_progress_in_a_terminal_is_one_line_that_is_redrawn(config, monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    with progress(config, with_rohe=False) as show:
+        for chunk in halves(make_metrics()):
+            show(chunk)
+    shown = sys.stderr.getvalue()
+    assert "100%" in shown
+    assert f"{make_metrics().successes.sum()} successes" in shown
+    assert "steps/s" in shown
+    assert "ROHE" not in shown
+    assert shown.count("\n") == 1
+
+
+def test_tables_tell_the_totals(config):
+    metrics = make_metrics()
+    shown = text.run_table(metrics, config)
+    for name in ("successes", "violations", "hard_resets", "idle", "human_steps", "teleop_steps", "switches"):
+        assert f" {getattr(metrics, name).sum()} " in shown
+    assert text.share(metrics.risk_choices.sum(), metrics.choices.sum()) in shown
+    assert str(metrics.idle.sum()) in text.evaluation_table(metrics, config).splitlines()[1]
+
+
+def test_every_algorithm_has_a_name_and_a_meaning():
+    for name in fleetjax.list_algorithms():
+        assert text.label(name)
+        assert text.is_order(name) or text.meaning(name)
+    assert text.label("ruc") == "R.U.C."
+    assert not text.is_order("cc")
+    assert not text.is_order("")

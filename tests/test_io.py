@@ -1,0 +1,197 @@
+"""Run folders, figures, tables and progress: what is written comes back, and what is damaged is refused."""
+
+import functools
+import json
+from pathlib import Path
+
+import hypothesis
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+from commands import make_metrics
+from hypothesis import strategies
+
+import fleetjax
+from fleetjax.io import execution, folder
+from fleetjax.learning.imitation import make_learner
+from fleetjax.learning.networks import Normalizer
+from fleetjax.metrics import Metrics
+
+STEPS = 40
+
+
+@functools.cache
+def make_policy():
+    learner = make_learner(make_tiny_config(), fleetjax.envs.make("navigation").spec)
+    return jax.jit(learner.init)(jax.random.key(3), Normalizer(jnp.arange(8.0), jnp.arange(1.0, 9.0)))
+
+
+@pytest.fixture
+def config():
+    return make_tiny_config()
+
+
+def make_tiny_config():
+    return fleetjax.make_config("navigation", num_steps=STEPS, hidden_sizes=(8,), uncertainty_threshold=0.07)
+
+
+@pytest.fixture
+def saved(tmp_path, config):
+    """A finished run folder."""
+    path = tmp_path / "a run"
+    folder.create(path, config, 5, overwrite=False)
+    folder.write_policy(path, make_policy())
+    folder.write_metrics(path, make_metrics())
+    folder.write_config(path, config, 5)
+    return path
+
+
+def test_a_run_folder_comes_back_as_it_was(saved, config):
+    run = folder.read_run(saved)
+    assert run.seed == 5
+    assert folder.to_plain(run.config) == folder.to_plain(config)
+    jax.tree.map(np.testing.assert_array_equal, run.config, config)
+    for read, written in zip(folder.read_metrics(run), make_metrics(), strict=True):
+        assert read.dtype == written.dtype
+        np.testing.assert_array_equal(read, written)
+    read, written = folder.read_policy(run), make_policy()
+    jax.tree.map(np.testing.assert_array_equal, (read.params, read.normalizer), (written.params, written.normalizer))
+
+
+def test_pandas_opens_the_metrics(saved):
+    frame = pd.read_csv(saved / "metrics.csv")
+    assert list(frame.columns) == ["timestep", *Metrics._fields]
+    assert frame["timestep"].tolist() == list(range(STEPS))
+    assert frame["successes"].dtype == np.int64
+    np.testing.assert_array_equal(frame["reward"].to_numpy(np.float32), make_metrics().reward)
+
+
+def test_the_configuration_is_plain_json_with_seed_and_versions(saved):
+    content = json.loads((saved / "config.json").read_text())
+    assert content["config"]["uncertainty_threshold"] == 0.07
+    assert content["config"]["hidden_sizes"] == [8]
+    assert content["config"]["normalize_observations"] is True
+    assert content["seed"] == 5
+    assert set(content["versions"]) == {"fleetjax", "jax", "mujoco"}
+    assert not [path.name for path in saved.iterdir() if path.name.endswith(".partial")]
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
+    path = tmp_path / "file"
+    folder.write(path, b"old")
+    monkeypatch.setattr(folder.os, "fsync", lambda descriptor: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    with pytest.raises(OSError, match="No space left"):
+        folder.write(path, b"new")
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def flip(path: Path, place: int = -40) -> None:
+    data = bytearray(path.read_bytes())
+    data[place] ^= 1
+    path.write_bytes(data)
+
+
+def change(path: Path, **fields) -> None:
+    content = json.loads(path.read_text())
+    content["config"] |= fields
+    path.write_text(json.dumps(content))
+
+
+DAMAGES = {
+    "no folder": (lambda run: [path.unlink() for path in run.iterdir()] and run.rmdir(), "there is none"),
+    "no config": (lambda run: (run / "config.json").unlink(), "config.json is missing"),
+    "no metrics": (lambda run: (run / "metrics.csv").unlink(), "metrics.csv is missing"),
+    "no policy": (lambda run: (run / "policy.msgpack").unlink(), "policy.msgpack is missing"),
+    "policy cut": (lambda run: (run / "policy.msgpack").write_bytes(b"\x82\xa6params"), "SHA-256"),
+    "bit in policy": (lambda run: flip(run / "policy.msgpack"), "SHA-256"),
+    "bit in metrics": (lambda run: flip(run / "metrics.csv"), "SHA-256"),
+    "no JSON": (lambda run: (run / "config.json").write_text("{"), "config.json cannot be used"),
+    "no text": (lambda run: (run / "config.json").write_bytes(b"\xff\xfe\x00"), "config.json cannot be used"),
+    "deep JSON": (lambda run: (run / "config.json").write_text("[" * 200_000), "nested too deeply"),
+    "a list": (lambda run: (run / "config.json").write_text("[1]"), "not fleetjax's"),
+    "a foreign file": (lambda run: (run / "config.json").write_text('{"config": {"lr": 1}}'), "seed = None"),
+    "unknown field": (lambda run: change(run / "config.json", flux=1), "unknown fields: flux"),
+    "wrong type": (lambda run: change(run / "config.json", num_robots="many"), "num_robots = 'many'"),
+    "wrong list": (lambda run: change(run / "config.json", hidden_sizes=7), "hidden_sizes = 7"),
+    "not a number": (lambda run: change(run / "config.json", risk_threshold=float("nan")), "risk_threshold = nan"),
+    "out of range": (lambda run: change(run / "config.json", num_humans=101), "num_humans = 101"),
+    "unknown environment": (lambda run: change(run / "config.json", environment="mars"), "environment = 'mars' is unknown"),
+    "other shapes": (lambda run: change(run / "config.json", hidden_sizes=[9]), "shapes"),
+    "other layers": (lambda run: change(run / "config.json", hidden_sizes=[8, 8]), "policy.msgpack cannot be used"),
+}
+
+
+def read_all(path: Path) -> None:
+    run = folder.read_run(path)
+    folder.read_metrics(run)
+    folder.read_policy(run)
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_damaged_and_foreign_folders_are_refused_with_the_reason(saved, name):
+    damage, reason = DAMAGES[name]
+    damage(saved)
+    with pytest.raises(ValueError, match=reason) as caught:
+        read_all(saved)
+    assert str(saved) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        ("timestep,successes", "timestep,triumphs", "columns"),
+        ("\n7,", "\n8,", "timesteps are missing"),
+        ("\n7,", "\n7,7,", "metrics.csv cannot be used"),
+        ("\n7,", "\n7,x", "metrics.csv cannot be used"),
+        ("\n7,", "\n7,99999999999", "metrics.csv cannot be used"),
+    ],
+)
+def test_metrics_that_make_no_sense_are_refused_even_where_the_digest_fits(saved, config, old, new, reason):
+    path = saved / "metrics.csv"
+    path.write_text(path.read_text().replace(old, new))
+    folder.write_config(saved, config, 5)
+    with pytest.raises(ValueError, match=reason):
+        folder.read_metrics(folder.read_run(saved))
+
+
+def test_a_policy_that_is_not_finite_is_refused(saved, config):
+    policy = make_policy()
+    folder.write_policy(saved, policy._replace(normalizer=policy.normalizer._replace(mean=jnp.full(8, jnp.nan))))
+    folder.write_config(saved, config, 5)
+    with pytest.raises(ValueError, match="not finite"):
+        folder.read_policy(folder.read_run(saved))
+
+
+def test_default_folders_are_new(tmp_path, monkeypatch, config):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(folder.time, "strftime", lambda form: "20300102-030405")
+    first = folder.default_folder(config, 3)
+    assert str(first) == "runs/navigation-cur-seed3-20300102-030405"
+    folder.create(first, config, 3, overwrite=False)
+    assert folder.default_folder(config, 3).name == f"{first.name}-2"
+
+
+def test_overwriting_spares_what_fleetjax_did_not_write(saved, config):
+    (saved / "notes.txt").write_text("mine")
+    with pytest.raises(FileExistsError, match="--overwrite"):
+        folder.create(saved, config, 6, overwrite=False)
+    assert folder.read_run(saved).seed == 5
+    folder.create(saved, config, 6, overwrite=True)
+    assert {path.name for path in saved.iterdir()} == {"config.json", "notes.txt"}
+    assert folder.read_run(saved).seed == 6
+
+
+@hypothesis.given(strategies.integers(1, 200_000))
+def test_chunks_add_up_and_need_at_most_two_programs(num_steps):
+    lengths = execution.chunks_of(num_steps)
+    assert sum(lengths) == num_steps
+    assert len(set(lengths)) <= 2
+    assert len(lengths) <= 3 * execution.CHUNKS + 1
+
+
+def test_a_paper_scale_run_is_a_hundred_equal_chunks():
+    assert execution.chunks_of(10_000) == [100] * 100
+    assert execution.chunks_of(2_000) == [20] * 100

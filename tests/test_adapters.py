@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import QUICKLY
+from compiling import compiled
 
 import fleetjax
 from fleetjax import envs, supervisors
@@ -37,13 +37,13 @@ def pendulum() -> envs.Env:
 @pytest.fixture(scope="module")
 def step(pendulum):
     vmapped = jax.vmap(pendulum.step, in_axes=(0, 0, None, None))
-    return jax.jit(lambda state, action: vmapped(state, action, True, jax.random.key(0)), compiler_options=QUICKLY)
+    return compiled(lambda state, action: vmapped(state, action, True, jax.random.key(0)))
 
 
 @pytest.fixture(scope="module")
 def start(pendulum):
     keys = jax.random.split(jax.random.key(0), NUM_ROBOTS)
-    return jax.jit(jax.vmap(pendulum.reset), compiler_options=QUICKLY)(keys, jnp.arange(NUM_ROBOTS))
+    return compiled(jax.vmap(pendulum.reset))(keys, jnp.arange(NUM_ROBOTS))
 
 
 def test_brax_spec(pendulum):
@@ -81,7 +81,7 @@ def test_a_state_that_is_no_number_is_a_violation(start, step):
 
 def test_fleet_runs_on_brax(pendulum):
     config = fleetjax.make_config(pendulum, "expert", num_robots=4, num_steps=HORIZON + 5, hidden_sizes=(8,), batch_size=16)
-    run = jax.jit(functools.partial(fleetjax.run, env=pendulum), compiler_options=QUICKLY)
+    run = compiled(functools.partial(fleetjax.run, env=pendulum))
     metrics = run(config, jax.random.key(0)).metrics
     assert metrics.teleop_steps.tolist() == [4] * (HORIZON + 5)
     assert metrics.reward.tolist() == [4.0] * (HORIZON + 5)

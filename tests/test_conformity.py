@@ -1,4 +1,4 @@
-"""What every registered environment, supervisor and algorithm must do, none of them named here; then the whole loop."""
+"""What every registered environment, supervisor and algorithm must do; none of them is named here."""
 
 import functools
 
@@ -6,12 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import QUICKLY
+from compiling import compiled
 
 import fleetjax
 from fleetjax import HumanState, Signals, envs, priority, supervisors
 from fleetjax.allocation import allocate
-from fleetjax.config import FIELDS
 from fleetjax.physics.base import PhysicsState
 
 NUM_ROBOTS = 8
@@ -20,9 +19,6 @@ NUM_STEPS = 200
 each_env = pytest.mark.parametrize("name", fleetjax.list_envs())
 each_supervisor = pytest.mark.parametrize("name", fleetjax.list_supervisors())
 each_algorithm = pytest.mark.parametrize("name", fleetjax.list_algorithms())
-
-
-compiled = functools.partial(jax.jit, compiler_options=QUICKLY)
 
 
 class Suite:
@@ -283,105 +279,3 @@ def test_algorithm_gives_no_human_for_nan(name, settings):
         score, _, robot = jitted(name)(settings, signals, aux, jax.random.key(0))
         assert np.all(np.nan_to_num(score)[robot[robot >= 0]] > 0)
         assert len(np.unique(robot[robot >= 0])) == np.sum(robot >= 0)
-
-
-# The whole loop
-
-
-TINY = {
-    "num_robots": 8,
-    "num_humans": 3,
-    "num_steps": 40,
-    "ensemble_size": 2,
-    "hidden_sizes": (8,),
-    "batch_size": 16,
-    "human_capacity": 500,
-    "critic_capacity": 200,
-    "num_demonstrations": 200,
-    "pretraining_steps": 20,
-    "critic_pretraining_steps": 20,
-    "num_critic_transitions": 100,
-    "uncertainty_threshold": 0.01,
-    "hard_reset_time": 3,
-}
-COUNTS = [name for name in fleetjax.Metrics._fields if name not in ("reward", "uncertainty", "policy_loss")]
-
-
-def counts(metrics) -> dict[str, np.ndarray]:
-    return {name: np.asarray(getattr(metrics, name)) for name in COUNTS}
-
-
-@pytest.fixture(scope="module")
-def tiny():
-    return fleetjax.make_config("navigation", "cur", **TINY)
-
-
-@pytest.fixture(scope="module")
-def run():
-    return compiled(fleetjax.run)
-
-
-def test_no_traced_field_recompiles(tiny, run):
-    """Every traced field gets another value, and the compiled program serves both."""
-    before = run(tiny, jax.random.key(0))
-    traced = [name for name, field in FIELDS.items() if field.traced]
-    assert len(traced) >= 20
-    changed = {}
-    for name in traced:
-        value = np.asarray(getattr(tiny, name))
-        if value.dtype == bool:
-            changed[name] = not value
-        elif value.dtype == np.int32:
-            changed[name] = int(value) - 10 if value > 20 else int(value) + 1
-        else:
-            changed[name] = 0.7 * float(value) + 0.01
-    after = run(tiny.replace(**changed), jax.random.key(0))
-    assert run._cache_size() == 1
-    assert np.any(np.asarray(before.metrics.reward) != np.asarray(after.metrics.reward))
-    assert int(after.state.human_data.pairs.added) != int(before.state.human_data.pairs.added)
-
-
-def test_vmap_over_seeds_is_a_loop_over_seeds(tiny, run):
-    """Every count of every timestep is equal to the last one; rewards and losses to rounding."""
-    keys = jax.random.split(jax.random.key(1), 3)
-    together = compiled(jax.vmap(fleetjax.run, in_axes=(None, 0)))(tiny, keys).metrics
-    assert len(np.unique(np.asarray(together.reward), axis=0)) == 3
-    for i, key in enumerate(keys):
-        alone = run(tiny, key).metrics
-        one = jax.tree.map(lambda x, i=i: x[i], together)
-        assert_same(counts(one), counts(alone))
-        np.testing.assert_allclose(one.reward, alone.reward, rtol=1e-4, atol=1e-4)
-        np.testing.assert_allclose(one.policy_loss, alone.policy_loss, rtol=1e-3, atol=1e-5)
-
-
-def test_loop_jitted_is_not_jitted(tiny, run):
-    """A timestep by `plan` and `advance`, operation by operation, has the counts and the state of the compiled one."""
-    state, key = run(tiny, jax.random.key(2)).state, jax.random.key(3)
-    step = fleetjax.make_fleet(tiny, envs.make("navigation")).step
-    (after, metrics), (expected, expected_metrics) = step(state, key), compiled(step)(state, key)
-    assert_same(counts(metrics), counts(expected_metrics))
-    assert_same(after.humans, expected.humans)
-    assert_close(after, expected)
-
-
-def is_mujoco_robot(name: str) -> bool:
-    state = jax.eval_shape(envs.make(name).reset, jax.random.key(0), jnp.int32(0))
-    return isinstance(state.physics, PhysicsState)
-
-
-@pytest.mark.parametrize("name", [name for name in fleetjax.list_envs() if is_mujoco_robot(name)])
-def test_loop_runs_on_mjx(name):
-    """Demonstrations, pre-training and a few timesteps; a demonstration is cut short, since MJX takes its time on a CPU."""
-    env = envs.make(name, "mjx")
-    short = env._replace(step=jax.jit(env.step), spec=env.spec._replace(horizon=12))
-    config = fleetjax.make_config(name, "uc", **TINY | {"num_steps": 6, "num_demonstrations": 40, "backend": "mjx"})
-    result = compiled(functools.partial(fleetjax.run, env=short))(config, jax.random.key(0))
-    metrics = result.metrics
-    assert np.all(metrics.moving + metrics.idle == TINY["num_robots"])
-    assert metrics.teleop_steps.sum() > 0
-    assert int(result.state.human_data.pairs.size) == 40 + int(metrics.teleop_steps.sum())
-    assert np.all(np.isfinite(metrics.reward))
-    assert np.all(np.isfinite(metrics.policy_loss))
-    assert np.all(np.isfinite(result.state.env.obs))
-    assert not np.any(result.state.env.physics.diverged)
-    np.testing.assert_allclose(result.state.env.physics.time, result.state.env.episode_step * env.spec.control_step, rtol=1e-4)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from compiling import QUICKLY
+from compiling import compiled
 from record_states import FILE, count_contacts
 
 from fleetjax import envs, supervisors
@@ -26,8 +26,7 @@ class Robots:
 
     def __init__(self, backend: str):
         self.env = envs.make("humanoid", backend)
-        options = QUICKLY if backend == "mjx" else None
-        self._step = jax.jit(jax.vmap(self.env.step, in_axes=(0, 0, 0, None)), compiler_options=options)
+        self._step = compiled(jax.vmap(self.env.step, in_axes=(0, 0, 0, None)))
 
     def step(self, state: envs.base.EnvState, action, active=True) -> envs.base.EnvState:
         return self._step(state, action, jnp.broadcast_to(active, NUM_ROBOTS), jax.random.key(0))
@@ -266,7 +265,7 @@ def test_mjx_is_differentiable_forwards():
         return jnp.concatenate([after.qpos, after.qvel])
 
     directions = jnp.eye(4)
-    derive = jax.jit(jax.vmap(lambda *point: jax.jvp(move, point[:1], point[1:])), compiler_options=QUICKLY)
+    derive = compiled(jax.vmap(lambda *point: jax.jvp(move, point[:1], point[1:])))
     forward, derivative = derive(0.05 * directions, 0 * directions)[0], derive(0 * directions, directions)[1]
     backward = derive(-0.05 * directions, 0 * directions)[0]
     differences = (forward - backward) / 0.1

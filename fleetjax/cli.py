@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import jax
+import numpy as np
 
 from fleetjax import envs
 from fleetjax.config import FIELDS, Config, make_config, validate
@@ -171,12 +172,13 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     seed = (run.seed + 1) % 2**32 if arguments.seed is None else arguments.seed
     chunks: list[Metrics] = []
     say(f"{text.headline(config, seed)}, nobody teleoperates: compiling ...")
+    evaluation = execution.start_evaluation(config, jax.random.key(seed), learner)
     with progress(config, with_rohe=False) as show:
-        for metrics in execution.evaluate_in_chunks(config, jax.random.key(seed), learner):
+        for metrics in evaluation:
             chunks.append(metrics)
             show(metrics)
     metrics = execution.join(chunks)
-    total = {name: value for name, value in text.add_up(metrics).items() if name in _EVALUATED}
+    total = {name: np.sum(getattr(metrics, name)).item() for name in _EVALUATED}
     content = {"num_steps": config.num_steps, "seed": seed, "totals": total, "versions": folder.versions()}
     folder.write_json(output, content)
     print(text.evaluation_table(metrics, config))

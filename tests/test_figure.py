@@ -42,6 +42,13 @@ def test_seeds_become_one_line_and_settings_another(config):
     np.testing.assert_array_equal(groups[0].values[0, 0], np.cumsum(make_metrics(3).successes)[:30])
 
 
+def test_labels_tell_environments_and_settings_apart(config):
+    humanoid = fleetjax.make_config("humanoid")
+    runs = [(c, 0, make_metrics()) for c in (config, humanoid, humanoid.replace(risk_threshold=0.25))]
+    labels = [curves.label for curves in figure.group(runs)]
+    assert labels == ["C.U.R., navigation", "C.U.R., humanoid, risk_threshold 0.5", "C.U.R., humanoid, risk_threshold 0.25"]
+
+
 def test_the_band_is_one_standard_deviation_about_the_mean(config):
     runs = [(config, seed, make_metrics(seed)) for seed in range(3)]
     axes = figure.draw(figure.group(runs)).axes
@@ -86,12 +93,9 @@ def test_progress_without_a_terminal_is_a_few_lines(config, capsys):
     assert "left" in lines[-1]
 
 
-def test_progress_in_a_terminal_is_one_line_that_is_redrawn(config, monkeypatch):
-    class Terminal(io.StringIO):
-        def isatty(self):
-            return True
-
-    monkeypatch.setattr(sys, "stderr", Terminal())
+def test_progress_in_a_terminal_is_redrawn_in_place(config, monkeypatch):
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    monkeypatch.setattr("fleetjax.io.progress._is_screen", lambda: True)
     with progress(config, with_rohe=False) as show:
         for chunk in halves(make_metrics()):
             show(chunk)
@@ -100,7 +104,7 @@ def test_progress_in_a_terminal_is_one_line_that_is_redrawn(config, monkeypatch)
     assert f"{make_metrics().successes.sum()} successes" in shown
     assert "steps/s" in shown
     assert "ROHE" not in shown
-    assert shown.count("\n") == 1
+    assert shown.count("\r") >= 4
 
 
 def test_tables_tell_the_totals(config):

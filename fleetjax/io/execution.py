@@ -72,17 +72,25 @@ def go_on(config: Config, key: jax.Array, state: FleetState, lengths: list[int])
         yield jax.device_get(metrics), state
 
 
-def evaluate_in_chunks(config: Config, key: jax.Array, learner: LearnerState) -> Iterator[Metrics]:
-    """Evaluate a trained policy; together the chunks are `evaluate(config, key, learner)`.
+def start_evaluation(config: Config, key: jax.Array, learner: LearnerState) -> Iterator[Metrics]:
+    """Compile the evaluation of a trained policy, and return what runs it, chunk after chunk.
 
-    Yields:
-        Metrics[C] in numpy arrays.
+    Returns:
+        Iterator of Metrics[C] in numpy arrays; together they are those of `evaluate(config, key, learner)`.
     """
     length, *others = chunks_of(config.num_steps)
-    metrics, state = jax.jit(evaluate)(config.replace(num_steps=length), key, learner)
-    yield jax.device_get(metrics)
-    for metrics, _ in go_on(config.replace(algorithm="constraint"), key, state, others):
-        yield metrics
+    first = config.replace(num_steps=length)
+    begin = jax.jit(evaluate).lower(first, key, learner).compile()
+    config = config.replace(algorithm="constraint")  # nobody teleoperates
+    if others:
+        _advance.lower(config.replace(num_steps=others[0]), key, begin.out_info.state).compile()
+
+    def chunks() -> Iterator[Metrics]:
+        metrics, state = begin(first, key, learner)
+        yield jax.device_get(metrics)
+        yield from (metrics for metrics, _ in go_on(config, key, state, others))
+
+    return chunks()
 
 
 def join(chunks: list[Metrics]) -> Metrics:

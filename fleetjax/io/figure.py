@@ -101,14 +101,12 @@ def _labels(settings: Sequence[dict[str, Any]]) -> list[str]:
     """Return a name for each setting: the algorithm, and the fields in which settings of that algorithm differ."""
     names = []
     for fields in settings:
-        alike = [other for other in settings if other["algorithm"] == fields["algorithm"]]
+        alike = [other for other in settings if all(other[name] == fields[name] for name in ("algorithm", "environment"))]
         differing = [name for name in fields if any(other[name] != fields[name] for other in alike)]
         if len(differing) > 1 and "human_capacity" in differing:
             differing.remove("human_capacity")  # it follows from the others
-        if len({other["environment"] for other in settings}) > 1:
-            differing = ["environment"]  # whose defaults differ in more than can be read
-        extra = [fields[name] if name == "environment" else f"{name} {fields[name]}" for name in differing]
-        names.append(", ".join([text.label(fields["algorithm"]), *extra]))
+        place = [fields["environment"]] * (len({other["environment"] for other in settings}) > 1)
+        names.append(", ".join([text.label(fields["algorithm"]), *place, *(f"{name} {fields[name]}" for name in differing)]))
     return names
 
 

@@ -1,9 +1,11 @@
 """Progress of a run on the screen: percent, rate, time left, and the live counts."""
 
 import contextlib
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 from tqdm import tqdm
 
@@ -23,7 +25,7 @@ def say(message: str) -> None:
 def progress(config: Config, *, with_rohe: bool = True) -> Iterator[Callable[[Metrics], None]]:
     """Yield a function that takes the Metrics[C] of each chunk of timesteps and shows how the run stands.
 
-    A terminal gets a bar that is redrawn, anything else a line every tenth of the run.
+    A terminal gets a bar and a line that are redrawn, anything else a line every tenth of the run.
 
     Args:
         config: configuration of the run.
@@ -33,23 +35,33 @@ def progress(config: Config, *, with_rohe: bool = True) -> Iterator[Callable[[Me
 
     def counts(chunk: Metrics) -> str:
         total.update({name: total[name] + more for name, more in text.add_up(chunk).items()})
-        return ", ".join(
-            [f"ROHE {text.rohe_of(total, config):.3f}"] * with_rohe
-            + [f"{text.count(total['successes'])} successes", f"{text.count(total['violations'])} violations"]
-            + [f"{chunk.human_steps[-1]} humans busy", f"{chunk.idle[-1]} idle"]
-        )
+        parts = [f"{text.count(total['successes'])} successes", f"{text.count(total['violations'])} violations"]
+        parts += [f"{chunk.human_steps[-1]} humans busy", f"{chunk.idle[-1]} idle"]
+        return ", ".join(parts + [f"ROHE {text.rohe_of(total, config):.3f}"] * with_rohe)
 
-    if sys.stderr.isatty():
-        form = "{percentage:3.0f}% |{bar}| {rate_noinv_fmt}, {remaining} left, {desc}"
-        with tqdm(total=config.num_steps, unit="steps", dynamic_ncols=True, bar_format=form, file=sys.stderr) as bar:
-
-            def redraw(chunk: Metrics) -> None:
-                bar.set_description_str(counts(chunk), refresh=False)
-                bar.update(len(chunk.successes))
-
-            yield redraw
-    else:
+    if not _is_screen():
         yield _log(config.num_steps, counts)
+        return
+    form = "{percentage:3.0f}% |{bar}| {rate_noinv_fmt}, {remaining} left"
+    options: dict[str, Any] = {"dynamic_ncols": True, "file": sys.stderr}
+    with (
+        tqdm(total=config.num_steps, unit=" steps", bar_format=form, **options) as bar,
+        tqdm(bar_format="  {desc}", position=1, **options) as line,
+    ):
+
+        def redraw(chunk: Metrics) -> None:
+            line.set_description_str(counts(chunk))
+            bar.update(len(chunk.successes))
+
+        yield redraw
+
+
+def _is_screen() -> bool:
+    """Return whether stderr is a terminal on which lines can be redrawn."""
+    try:
+        return os.get_terminal_size(sys.stderr.fileno()).lines > 2
+    except (OSError, ValueError):  # a file, a pipe, or no file at all
+        return False
 
 
 def _log(num_steps: int, counts: Callable[[Metrics], str]) -> Callable[[Metrics], None]:

@@ -22,7 +22,7 @@ def main() -> None:
     for folder in parser.parse_args().runs:
         config = json.loads((folder / "config.json").read_text())
         metrics = pd.read_csv(folder / "metrics.csv")
-        times.append(int(metrics["human_steps"].sum()))
+        times.append(int(metrics["human_steps"].to_numpy().sum()))
         capacity = config["config"]["num_humans"] * len(metrics)
         print(f"{folder}: {times[-1]} of {capacity} human timesteps, {100 * times[-1] / capacity:.1f} %")
     print(f"mean {statistics.mean(times):.0f}")

@@ -199,7 +199,8 @@ def ship(name: str, folder: Path, *, candidates: int, num_episodes: int) -> None
     best = None
     for path in ranked[:candidates]:
         weights = as_weights(serialization.from_bytes(template(task), path.read_bytes()))
-        returns, lengths = expert.score(task.env, weights, num_episodes=num_episodes, key=jax.random.key(1))
+        score = jax.jit(lambda w, key: expert.score(task.env, w, num_episodes=num_episodes, key=key))
+        returns, lengths = map(np.asarray, score(weights, jax.random.key(1)))
         full = lengths == task.env.spec.horizon
         mean = float(returns[full].mean()) if full.any() else float("nan")
         record = {

@@ -23,7 +23,7 @@ __all__ = [
 ]
 
 # Human timesteps, hard resets included, that C.U.R. asked for in a run with default settings; the `constraint` baseline gets
-# as many extra demonstrations. Measured by `python experiments/human_time.py RUN...` (so far one seed of Humanoid; none elsewhere).
+# as many extra demonstrations. Measured by `python experiments/human_time.py RUN...`, so far on one seed of Humanoid only.
 CUR_HUMAN_TIME: dict[str, int] = {"humanoid": 8836}
 
 

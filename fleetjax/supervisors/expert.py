@@ -6,13 +6,16 @@ tanh behind the last) and a JSON of its measured returns; `experiments/train_exp
 
 import functools
 import json
+from collections.abc import Mapping
 from importlib import resources
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from fleetjax import tree
 from fleetjax.envs.base import Env
+from fleetjax.types import EnvState
 
 _WEIGHTS = resources.files("fleetjax.supervisors") / "weights"
 
@@ -42,7 +45,7 @@ def load_weights(name: str) -> dict[str, np.ndarray]:
         return dict(arrays)
 
 
-def policy(weights: dict[str, np.ndarray], obs: jax.Array) -> jax.Array:
+def policy(weights: Mapping[str, jax.Array | np.ndarray], obs: jax.Array) -> jax.Array:
     """Return the deterministic action f32[..., A] for observations f32[..., O]."""
     x = (obs - weights["obs_mean"]) / weights["obs_std"]
     layers = sum(name.startswith("kernel") for name in weights)
@@ -52,7 +55,9 @@ def policy(weights: dict[str, np.ndarray], obs: jax.Array) -> jax.Array:
     return x
 
 
-def score(env: Env, weights: dict[str, np.ndarray], *, num_episodes: int, key: jax.Array) -> tuple[np.ndarray, np.ndarray]:
+def score(
+    env: Env, weights: Mapping[str, jax.Array | np.ndarray], *, num_episodes: int, key: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """Run one episode a robot under a policy.
 
     Args:
@@ -67,13 +72,10 @@ def score(env: Env, weights: dict[str, np.ndarray], *, num_episodes: int, key: j
     key_reset, key_step = jax.random.split(key)
     start = jax.vmap(env.reset)(jax.random.split(key_reset, num_episodes), jnp.arange(num_episodes))
 
-    def step(state, key):
+    def step(state: EnvState, key: jax.Array) -> tuple[EnvState, None]:
         active = ~state.violation
-        keys = jax.random.split(key, num_episodes)
-        after = jax.vmap(env.step)(state, policy(weights, state.obs), active, keys)
-        keep = lambda old, new: jnp.where(active.reshape(active.shape + (1,) * (new.ndim - 1)), new, old)  # noqa: E731
-        return jax.tree.map(keep, state, after), None
+        after = jax.vmap(env.step)(state, policy(weights, state.obs), active, jax.random.split(key, num_episodes))
+        return tree.where(active, after, state), None
 
-    run = jax.jit(lambda state, keys: jax.lax.scan(step, state, keys)[0])
-    state = run(start, jax.random.split(key_step, env.spec.horizon))
-    return np.asarray(state.episode_return), np.asarray(state.episode_step)
+    state, _ = jax.lax.scan(step, start, jax.random.split(key_step, env.spec.horizon))
+    return state.episode_return, state.episode_step

@@ -127,7 +127,9 @@ def test_an_interrupted_run_keeps_its_metrics(finished, tmp_path, monkeypatch, c
 
 def test_ctrl_c_before_the_first_timestep_leaves_nothing(tmp_path):
     command = [sys.executable, "-m", "fleetjax", "run", "navigation", "--output", str(tmp_path / "new" / "run")]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    listen = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # noqa: E731  a background shell's children ignore it
+    pipes = {"stderr": subprocess.PIPE, "stdout": subprocess.PIPE}
+    process = subprocess.Popen(command, text=True, preexec_fn=listen, **pipes)
     assert process.stderr is not None
     assert "compiling and pre-training" in process.stderr.readline()
     process.send_signal(signal.SIGINT)

@@ -130,7 +130,7 @@ def test_env_keeps_the_accounts_of_an_episode(name):
 
 @each_env
 def test_env_never_resets_itself(name):
-    """What follows depends on the state alone, not on flags and accounts: an episode that ended just goes on."""
+    """A robot in violation mostly stays there, and what follows depends on the state alone, not on flags and accounts."""
     s = suite(name)
     state, keys, falls = s.before_violation()
     ended = s.step(state, s.action, s.active, keys)
@@ -141,6 +141,7 @@ def test_env_never_resets_itself(name):
     one, other = (s.step(x, s.action, s.active, keys) for x in (ended, unmarked))
     assert_same((one.physics, one.obs, one.reward, one.violation), (other.physics, other.obs, other.reward, other.violation))
     np.testing.assert_array_equal(one.episode_step, s.env.spec.horizon + 1)
+    assert np.mean(one.violation[falls]) > 0.5
 
 
 @each_env
@@ -163,6 +164,16 @@ def test_env_violation_beats_success_and_timeout(name):
     after = s.step(late, s.action, s.active, keys)
     assert np.all(after.violation[falls])
     assert not np.any(after.violation & (after.success | after.timeout))
+
+
+def test_a_violation_beats_what_else_a_step_says():
+    before = envs.begin(jnp.zeros(1), jnp.zeros(1))
+    yes = jnp.ones((), bool)
+    for violation in (yes, ~yes):
+        one = envs.proceed(
+            before, physics=before.physics, obs=before.obs, reward=jnp.ones(()), violation=violation, horizon=1, success=yes
+        )
+        assert (bool(one.success), bool(one.timeout)) == (not violation, not violation)
 
 
 @each_env
@@ -271,11 +282,15 @@ def test_algorithm_scores(name, settings):
 
 @each_algorithm
 def test_algorithm_gives_no_human_for_nan(name, settings):
-    """Robots of which a signal is no number may get help for another reason, but never because of it."""
+    """A signal that is no number speaks for nobody: whoever gets a score, or help, would have a score if it were 0."""
     aux = priority.get_algorithm(name).make_priority(settings).init()
     for field in ("uncertainty", "risk", "goal"):
         signals = make_signals(jax.random.key(0))
-        signals = signals._replace(**{field: getattr(signals, field).at[::3].set(jnp.nan)})
-        score, _, robot = jitted(name)(settings, signals, aux, jax.random.key(0))
-        assert np.all(np.nan_to_num(score)[robot[robot >= 0]] > 0)
+        with_nan, with_zero = (
+            signals._replace(**{field: getattr(signals, field).at[::3].set(value)}) for value in (jnp.nan, 0.0)
+        )
+        expected = np.asarray(jitted(name)(settings, with_zero, aux, jax.random.key(0))[0])
+        score, _, robot = jitted(name)(settings, with_nan, aux, jax.random.key(0))
+        assert not np.any((score > 0) & (expected == 0))
+        assert np.all(expected[robot[robot >= 0]] > 0)
         assert len(np.unique(robot[robot >= 0])) == np.sum(robot >= 0)

@@ -1,11 +1,15 @@
-"""The pages below docs/ keep their promise: their Python blocks run, in order, without a warning."""
+"""The pages below docs/ keep their promise: their Python blocks run, in order. So do the examples in docstrings."""
 
+import doctest
+import importlib
+import pkgutil
 import re
 from pathlib import Path
 
 import jax
 import pytest
 
+import fleetjax
 from fleetjax import envs, priority, supervisors
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -51,3 +55,10 @@ def test_blocks_run(page, capsys):
         assert metrics.successes.sum() > 0
         assert metrics.hard_resets.sum() > 0
         assert "brax/inverted_pendulum" in capsys.readouterr().out
+
+
+def test_examples_in_docstrings():
+    names = [module.name for module in pkgutil.walk_packages(fleetjax.__path__, "fleetjax.")]
+    results = [doctest.testmod(importlib.import_module(name)) for name in names if name != "fleetjax.__main__"]
+    assert sum(result.attempted for result in results) > 5
+    assert not any(result.failed for result in results)

@@ -42,9 +42,9 @@ def start(config: Config, key: jax.Array) -> FleetState:
         FleetState: the state at t = 0; `go_on` from it finds its program compiled.
     """
     first = config.replace(num_steps=chunk_length(config.num_steps))
-    lowered = jax.jit(prepare).lower(config, key)
-    pool = ThreadPoolExecutor(2)
+    pool = ThreadPoolExecutor(2)  # this thread only waits: an interrupt within JAX's own code could get lost
     try:
+        lowered = pool.submit(lambda: jax.jit(prepare).lower(config, key)).result()
         state = pool.submit(lambda: jax.block_until_ready(lowered.compile()(config, key)))
         pool.submit(lambda: _advance.lower(first, key, lowered.out_info).compile()).result()
         return state.result()

@@ -49,6 +49,7 @@ class Plan(NamedTuple):
 
     Attributes:
         signals: Signals[N] that the scores were made from.
+        robot_action: f32[N, A] what the robots' policy would do.
         score: f32[N] priorities.
         humans: HumanState[M], the allocation; `duration` counts the timesteps before this one.
         teleoperated: bool[N] robots that a human teleoperates.
@@ -56,6 +57,7 @@ class Plan(NamedTuple):
     """
 
     signals: Signals
+    robot_action: jax.Array
     score: jax.Array
     humans: HumanState
     teleoperated: jax.Array
@@ -87,29 +89,25 @@ def make_fleet(config: Config, env: Env) -> Fleet:
     num_robots = config.num_robots
     robots = jnp.arange(num_robots)
 
-    def observe(state: FleetState) -> Signals:
+    def observe(state: FleetState) -> tuple[Signals, jax.Array]:
+        """Return the signals and what the robots' policy would do."""
         obs = state.env.obs
-        action = learner.act(state.learner, obs)
+        action, uncertainty = learner.predict(state.learner, obs)
         chance = {kind: c.value(state.critics[kind], state.learner.normalizer, obs, action) for kind, c in critics.items()}
         never = jnp.zeros(num_robots)
-        return Signals(
-            violation=state.env.violation,
-            uncertainty=learner.uncertainty(state.learner, obs),
-            risk=chance.get("safety", never),
-            goal=chance.get("goal", never),
-            timestep=state.timestep,
-        )
+        risk, goal = chance.get("safety", never), chance.get("goal", never)
+        return Signals(state.env.violation, uncertainty, risk, goal, state.timestep), action
 
     def plan(state: FleetState, key: jax.Array, available: jax.Array | None = None) -> tuple[FleetState, Plan]:
         key_score, key_ties = jax.random.split(key)
-        signals = observe(state)
+        signals, robot_action = observe(state)
         score, memory = rule.score(signals, state.priority, key_score)
         min_time = jnp.where(state.resetting, config.hard_reset_time, config.min_teleop_time)
         humans = allocate(score, state.humans, min_time, key_ties, available)
         helped = helper_of(humans, num_robots) >= 0
         resetting, teleoperated = helped & signals.violation, helped & ~signals.violation
         humans = _restart_clocks(humans, state.resetting, resetting, config.hard_reset_time)
-        return state._replace(priority=memory), Plan(signals, score, humans, teleoperated, resetting)
+        return state._replace(priority=memory), Plan(signals, robot_action, score, humans, teleoperated, resetting)
 
     def advance(
         state: FleetState, plan: Plan, human_action: jax.Array, given: jax.Array, key: jax.Array
@@ -119,7 +117,7 @@ def make_fleet(config: Config, env: Env) -> Fleet:
         given = given & plan.teleoperated
         moving = ~state.env.violation
         obs = state.env.obs
-        action = jnp.where(given[:, None], human_action, learner.act(state.learner, obs))
+        action = jnp.where(given[:, None], human_action, plan.robot_action)
 
         keys = jax.random.split(key_env, num_robots)
         stepped = tree.where(moving, jax.vmap(env.step)(state.env, action, moving, keys), state.env)

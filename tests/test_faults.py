@@ -161,7 +161,7 @@ def one_bootstrap_shared_by_all_members(patch, config, env):
 
     def append(*args):
         data = real(*args)
-        return data._replace(resample=jnp.broadcast_to(data.resample[:1], data.resample.shape))
+        return data._replace(resample=jnp.broadcast_to(data.resample[:, :1], data.resample.shape))
 
     patch.setattr(imitation, "append", append)
     return make_fleet(config, env)

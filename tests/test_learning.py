@@ -73,7 +73,7 @@ def test_safety_critic_foresees_falls_of_the_humanoid(humanoid_fleet):
     num_robots, num_steps, soon = 100, 150, 5
 
     def step(carry, key):
-        action = learner.act(state.learner, carry.obs)
+        action = learner.predict(state.learner, carry.obs)[0]
         risk = safety.value(state.critics["safety"], state.learner.normalizer, carry.obs, action)
         after = jax.vmap(env.step)(carry, action, ~carry.violation, jax.random.split(key, num_robots))
         after = tree.where(carry.violation, carry, after)

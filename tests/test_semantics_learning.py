@@ -143,7 +143,7 @@ def test_semantic_12_the_goal_critic_is_pretrained_on_the_expert_and_the_safety_
     learner = imitation.make_learner(config, env.spec)
     novice, expert = (state.critics[kind].negatives.rows for kind in ("safety", "goal"))
     assert expert.action[:44].tolist() == [[1.0]] * 44
-    np.testing.assert_allclose(novice.action[:45], learner.act(state.learner, novice.obs[:45]), atol=1e-5)
+    np.testing.assert_allclose(novice.action[:45], learner.predict(state.learner, novice.obs[:45])[0], atol=1e-5)
 
 
 def test_semantic_15_uncertainty_is_the_variance_between_members():
@@ -151,18 +151,18 @@ def test_semantic_15_uncertainty_is_the_variance_between_members():
     learner = imitation.make_learner(SMALL, spec)
     state = constant_policy(learner, np.arctanh([[0.5, 0.2], [-0.5, 0.2]]))
     obs = jnp.zeros((3, 1))
-    np.testing.assert_allclose(learner.uncertainty(state, obs), [0.125] * 3, rtol=1e-5)  # (0.25 + 0) / 2
-    np.testing.assert_allclose(learner.act(state, obs), [[0.0, 0.2]] * 3, atol=1e-6)
+    np.testing.assert_allclose(learner.predict(state, obs)[1], [0.125] * 3, rtol=1e-5)  # (0.25 + 0) / 2
+    np.testing.assert_allclose(learner.predict(state, obs)[0], [[0.0, 0.2]] * 3, atol=1e-6)
     state = constant_policy(learner, [[20.0, 20.0], [-20.0, -20.0]])
-    np.testing.assert_allclose(learner.uncertainty(state, obs), [1.0] * 3, rtol=1e-5)  # the largest possible
+    np.testing.assert_allclose(learner.predict(state, obs)[1], [1.0] * 3, rtol=1e-5)  # the largest possible
 
 
 def test_semantic_15_uncertainty_of_discrete_actions_is_shannon_entropy():
     spec = SPEC._replace(action_size=3, discrete=True)
     learner = imitation.make_learner(SMALL, spec)
     state = constant_policy(learner, np.log([[0.25, 0.5, 0.25]]))
-    assert float(learner.uncertainty(state, jnp.zeros(1))) == pytest.approx(1.5 * np.log(2), rel=1e-5)
-    assert learner.act(state, jnp.zeros(1)).tolist() == [0, 1, 0]
+    assert float(learner.predict(state, jnp.zeros(1))[1]) == pytest.approx(1.5 * np.log(2), rel=1e-5)
+    assert learner.predict(state, jnp.zeros(1))[0].tolist() == [0, 1, 0]
 
 
 @pytest.mark.parametrize(("kind", "expected"), [("safety", 0.6), ("goal", 0.3)])
@@ -184,7 +184,7 @@ def test_semantic_18_every_member_resamples_all_pairs_so_far_for_each_new_pair()
     data, _ = quick_jit(lambda data, keys: jax.lax.scan(add, data, keys))(data, jax.random.split(jax.random.key(0), arrivals))
     size = int(data.pairs.size)
     assert size == 3 * arrivals
-    resample = np.asarray(data.resample)
+    resample = np.asarray(data.resample).T
     so_far = 3 * (np.arange(size) // 3 + 1)
     assert np.all((resample[:, :size] >= 0) & (resample[:, :size] < so_far))
     assert not resample[:, size:].any()
@@ -200,7 +200,7 @@ def test_semantic_18_a_member_learns_from_its_own_resample_only():
     data = imitation.create_data(SPEC, ensemble_size=2, capacity=2)
     pairs = imitation.Pair(jnp.zeros((2, 1)), jnp.array([[1.0], [-1.0]]))
     data = imitation.append(data, pairs, jnp.ones(2, bool), jax.random.key(0))
-    data = data._replace(resample=jnp.array([[0, 0], [1, 1]]))  # one member sees only the first pair, one only the second
+    data = data._replace(resample=jnp.array([[0, 1], [0, 1]]))  # one member sees only the first pair, one only the second
     after, loss = quick_jit(learner.update)(state, data, jax.random.key(0))
     np.testing.assert_allclose(last_bias(after.params), [3e-4, -3e-4], rtol=1e-3)  # Adam's first step is the learning rate
     assert float(loss) == pytest.approx(1.0)

@@ -5,13 +5,15 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+COUNTED = 2**30  # rows; a ring that was given more counts on from its capacity, far from the end of i32
+
 
 class Buffer(NamedTuple):
     """Rows in order of arrival.
 
     Attributes:
         rows: pytree of arrays [capacity, ...].
-        added: i32[] rows added so far, in all.
+        added: i32[] rows added so far, in all (of a ring the last `COUNTED`, more or less).
     """
 
     rows: Any
@@ -49,7 +51,9 @@ def append(buffer: Buffer, rows: Any, mask: jax.Array, *, overwrite: bool) -> Bu
     slot = jnp.where(mask, place, buffer.capacity)  # out of range: dropped
     stored = jax.tree.map(lambda old, new: old.at[slot].set(new.astype(old.dtype), mode="drop"), buffer.rows, rows)
     added = buffer.added + jnp.sum(mask, dtype=jnp.int32)
-    return Buffer(stored, added if overwrite else jnp.minimum(added, buffer.capacity))
+    if overwrite:
+        return Buffer(stored, jnp.where(added < COUNTED, added, buffer.capacity + added % buffer.capacity))
+    return Buffer(stored, jnp.minimum(added, buffer.capacity))
 
 
 def draw_index(key: jax.Array, shape: tuple[int, ...], size: jax.Array) -> jax.Array:

@@ -121,7 +121,8 @@ def make_critic(kind: str, config: Config, spec: EnvSpec, learner: Learner) -> C
 
     def update(state: CriticState, policy: LearnerState, key: jax.Array) -> CriticState:
         batch, valid = sample(state, key)
-        next_value = twins(state.target, policy.normalizer, batch.next_obs, learner.act(policy, batch.next_obs))
+        next_action, _ = learner.predict(policy, batch.next_obs)
+        next_value = twins(state.target, policy.normalizer, batch.next_obs, next_action)
         reached = batch.violation if safety else batch.success
         goes_on = ~(batch.violation | reached)
         target = jnp.where(reached, 1.0, goes_on * discount * pessimistic(next_value, axis=0))

@@ -29,7 +29,7 @@ class HumanData(NamedTuple):
 
     Attributes:
         pairs: Buffer of `Pair`.
-        resample: i32[E, capacity] for each member, the pairs that it learns from; `pairs.size` of them count.
+        resample: i32[capacity, E] for each member, the pairs that it learns from; `pairs.size` of them count.
     """
 
     pairs: buffer.Buffer
@@ -49,21 +49,20 @@ class Learner(NamedTuple):
 
     Attributes:
         init: `(key, Normalizer) -> LearnerState`.
-        act: `(LearnerState, obs f32[..., O]) -> f32[..., A]`.
-        uncertainty: `(LearnerState, obs f32[..., O]) -> f32[...]` in [0, 1] (discrete: in nats).
+        predict: `(LearnerState, obs f32[..., O]) -> (action f32[..., A], uncertainty f32[...])`; the uncertainty lies in
+            [0, 1] (discrete: entropy in nats).
         update: `(LearnerState, HumanData, key) -> (LearnerState, loss f32[])`, one gradient step.
     """
 
     init: Any
-    act: Any
-    uncertainty: Any
+    predict: Any
     update: Any
 
 
 def create_data(spec: EnvSpec, *, ensemble_size: int, capacity: int) -> HumanData:
     """Return an empty data set."""
     example = Pair(jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size))
-    return HumanData(buffer.create(example, capacity), jnp.zeros((ensemble_size, capacity), jnp.int32))
+    return HumanData(buffer.create(example, capacity), jnp.zeros((capacity, ensemble_size), jnp.int32))
 
 
 def append(data: HumanData, pairs: Pair, mask: jax.Array, key: jax.Array) -> HumanData:
@@ -72,10 +71,9 @@ def append(data: HumanData, pairs: Pair, mask: jax.Array, key: jax.Array) -> Hum
     Reference: paper, Section 4.2 (ensemble bootstrapped on subsets of the training data).
     """
     grown = buffer.append(data.pairs, pairs, mask, overwrite=False)
-    members = data.resample.shape[0]
-    draws = buffer.draw_index(key, (members, mask.shape[0]), grown.size)
-    index = buffer.Buffer(data.resample.T, data.pairs.added)
-    return HumanData(grown, buffer.append(index, draws.T, mask, overwrite=False).rows.T)
+    draws = buffer.draw_index(key, (data.resample.shape[1], mask.shape[0]), grown.size)
+    index = buffer.append(buffer.Buffer(data.resample, data.pairs.added), draws.T, mask, overwrite=False)
+    return HumanData(grown, index.rows)
 
 
 def make_learner(config: Config, spec: EnvSpec) -> Learner:
@@ -93,16 +91,12 @@ def make_learner(config: Config, spec: EnvSpec) -> Learner:
         raw = jax.vmap(network.apply, in_axes=(0, None))(params, obs)
         return raw if spec.discrete else jnp.tanh(raw)
 
-    def act(state: LearnerState, obs: jax.Array) -> jax.Array:
-        mean = jnp.mean(outputs(state.params, state.normalizer(obs)), axis=0)
-        return jax.nn.one_hot(jnp.argmax(mean, axis=-1), spec.action_size) if spec.discrete else mean
-
-    def uncertainty(state: LearnerState, obs: jax.Array) -> jax.Array:
+    def predict(state: LearnerState, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
         answers = outputs(state.params, state.normalizer(obs))
         if spec.discrete:
             log_p = jax.nn.log_softmax(answers[0])
-            return -jnp.sum(jnp.exp(log_p) * log_p, axis=-1)
-        return jnp.mean(jnp.var(answers, axis=0), axis=-1)  # the largest variance on [-1, 1] is 1
+            return jax.nn.one_hot(jnp.argmax(log_p, axis=-1), spec.action_size), -jnp.sum(jnp.exp(log_p) * log_p, axis=-1)
+        return jnp.mean(answers, axis=0), jnp.mean(jnp.var(answers, axis=0), axis=-1)  # on [-1, 1] no variance exceeds 1
 
     def loss(params: Any, obs: jax.Array, action: jax.Array) -> jax.Array:
         answer = network.apply(params, obs)
@@ -112,10 +106,11 @@ def make_learner(config: Config, spec: EnvSpec) -> Learner:
 
     def update(state: LearnerState, data: HumanData, key: jax.Array) -> tuple[LearnerState, jax.Array]:
         draw = buffer.draw_index(key, (members, config.batch_size), data.pairs.size)
-        batch = take(data.pairs.rows, jnp.take_along_axis(data.resample, draw, axis=1))
+        index = data.resample[draw, jnp.arange(members)[:, None]]
+        batch = take(data.pairs.rows, index)
         losses, grads = jax.vmap(jax.value_and_grad(loss))(state.params, state.normalizer(batch.obs), batch.action)
         steps, opt_state = optimizer.update(grads, state.opt_state)
         params = jax.tree.map(lambda p, step: p - config.learning_rate * step, state.params, steps)
         return state._replace(params=params, opt_state=opt_state), jnp.mean(losses)
 
-    return Learner(init, act, uncertainty, update)
+    return Learner(init, predict, update)

@@ -125,7 +125,7 @@ def pretrain(
 
         def act(state: EnvState, key: jax.Array, kind: str = kind) -> jax.Array:
             if kind == "safety":
-                return learner.act(policy, state.obs)
+                return learner.predict(policy, state.obs)[0]
             return jax.vmap(supervisor.act)(state, jax.random.split(key, state.obs.shape[0]))
 
         full = collect_transitions(config, env, act, parts.append, parts.init(key_net), key_data)

@@ -85,7 +85,7 @@ def record(
         key_env, key_reset, key_goal, key_data, _ = jax.random.split(key_advance, 5)
         key_available, key_present = jax.random.split(jax.random.fold_in(key_t, 1))
 
-        robot_action = learner.act(state.learner, state.env.obs)
+        robot_action = learner.predict(state.learner, state.env.obs)[0]
         human_action = jax.vmap(supervisor.act)(state.env, jax.random.split(key_human, n))
         chance = {
             kind: parts.value(state.critics[kind], state.learner.normalizer, state.env.obs, robot_action)
@@ -96,12 +96,12 @@ def record(
             for name, action in {"robot": robot_action, "human": human_action}.items()
         }
         recorded = {
-            "uncertainty": learner.uncertainty(state.learner, state.env.obs),
+            "uncertainty": learner.predict(state.learner, state.env.obs)[1],
             "risk": chance.get("safety", jnp.zeros(n)),
             "goal": chance.get("goal", jnp.zeros(n)),
             "uniform": jax.random.uniform(key_score, (n,)),
             "tie_order": draw_permutation(key_ties, n),
-            "resample_bits": jax.random.bits(key_data, (state.human_data.resample.shape[0], n)),
+            "resample_bits": jax.random.bits(key_data, (state.human_data.resample.shape[1], n)),
             "available": jax.random.uniform(key_available, (m,)) >= absence,
             "present": jax.random.uniform(key_present, (n,)) >= silence,
             "robot_action": robot_action,
@@ -168,7 +168,7 @@ def compare(config: Config, env: Env, trace: Trace) -> list[oracle.Outcome]:
     """
     problem = problem_of(config, env)
     trace = jax.tree.map(np.asarray, trace)
-    fleet = oracle.start(problem, state_of(trace.first.env), trace.first.human_data.resample.shape[0])
+    fleet = oracle.start(problem, state_of(trace.first.env), trace.first.human_data.resample.shape[1])
     effort, outcomes = np.asarray(rohe(trace.metrics, config)), []
     for t in range(trace.metrics.idle.shape[0]):
         row = jax.tree.map(lambda x, t=t: x[t], trace._replace(first=None, last=None))
@@ -210,7 +210,7 @@ def _compare_data(last: FleetState, fleet: oracle.Fleet) -> None:
     size = len(fleet.data)
     for k, name in enumerate(("obs", "action")):
         same(f"human data: {name}", t, getattr(pairs.rows, name)[:size], rows_of(fleet.data, k, getattr(pairs.rows, name)))
-    same("resampled pairs", t, last.human_data.resample[:, :size], fleet.resample)
+    same("resampled pairs", t, last.human_data.resample[:size].T, fleet.resample)
     for kind, c in fleet.critics.items():
         for label in ("positives", "negatives"):
             ring, expected = getattr(last.critics[kind], label), getattr(c, label)

@@ -65,7 +65,9 @@ def make_counting_learner(config, spec) -> imitation.Learner:
 
     return imitation.Learner(
         init=lambda key, normalizer: imitation.LearnerState(jnp.zeros(()), Counter(jnp.int32(0)), normalizer),
-        act=lambda state, obs: jnp.broadcast_to(state.params, (*obs.shape[:-1], spec.action_size)),
-        uncertainty=lambda state, obs: jnp.broadcast_to(state.params, obs.shape[:-1]),
+        predict=lambda state, obs: (
+            jnp.broadcast_to(state.params, (*obs.shape[:-1], spec.action_size)),
+            jnp.broadcast_to(state.params, obs.shape[:-1]),
+        ),
         update=update,
     )

@@ -126,10 +126,10 @@ def test_an_interrupted_run_keeps_its_metrics(finished, tmp_path, monkeypatch, c
 
 
 def test_ctrl_c_before_the_first_timestep_leaves_nothing(tmp_path):
-    command = [sys.executable, "-m", "fleetjax", "run", "navigation", "--output", str(tmp_path / "new" / "run")]
-    listen = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # noqa: E731  a background shell's children ignore it
-    pipes = {"stderr": subprocess.PIPE, "stdout": subprocess.PIPE}
-    process = subprocess.Popen(command, text=True, preexec_fn=listen, **pipes)
+    listen = "signal.signal(signal.SIGINT, signal.default_int_handler)"  # a background shell's children ignore it
+    program = f"import signal, sys; {listen}; from fleetjax.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", program, "run", "navigation", "--output", str(tmp_path / "new" / "run")]
+    process = subprocess.Popen(command, text=True, stderr=subprocess.PIPE, stdout=subprocess.PIPE)
     assert process.stderr is not None
     assert "compiling and pre-training" in process.stderr.readline()
     process.send_signal(signal.SIGINT)

@@ -5,6 +5,7 @@ paper's (Section 5.2 and Appendix); environments change some of them, see `fleet
 """
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -67,7 +68,7 @@ class Config:
     min_teleop_time: int = _traced(5, "shortest teleoperation t_T", "timesteps", low=1)
     hard_reset_time: int = _traced(5, "duration of a hard reset t_R", "timesteps", low=1)
     initial_period: int = _traced(0, "time t_I before orders with C help robots in violation", "timesteps")
-    uncertainty_threshold: float = _traced(0.05, "uncertainty below which U is 0", high=1)
+    uncertainty_threshold: float = _traced(0.05, "uncertainty below which U is 0; in nats where actions are discrete")
     risk_threshold: float = _traced(0.5, "risk below which R is 0", high=1)
     random_threshold: float = _traced(0.9, "priority of `random` below which it is 0", high=1)
     thrifty_weight: float = _traced(0.25, "weight of the chance of failure in `thrifty_dagger`", high=1)
@@ -119,6 +120,8 @@ def _typed(name: str, value: Any) -> Any:
         return int(value) if field.kind is int else value
     try:
         array = jnp.asarray(value)
+    except OverflowError:
+        raise ValueError(f"{name} = {value!r} must lie within 32 bits") from None
     except TypeError:
         raise ValueError(f"{name} = {value!r} must be a number") from None
     if field.kind is int and not jnp.issubdtype(array.dtype, jnp.integer):
@@ -174,9 +177,22 @@ def make_config(environment: "str | envs.Env", algorithm: str = "cur", **overrid
         budget = {"pretraining_steps": fields["pretraining_steps"] + fields["num_steps"] * fields["gradient_steps"]}
         budget["extra_demonstrations"] = envs.CUR_HUMAN_TIME.get(name, 0)
         fields |= {k: v for k, v in budget.items() if k not in overrides}
+    if algorithm == "random" and name in envs.CUR_HUMAN_TIME and "random_threshold" not in overrides:
+        fields["random_threshold"] = _random_threshold(name, defaults)
     config = Config().replace(**fields)
     validate(config, environment if isinstance(environment, envs.Env) else None)
     return config
+
+
+def _random_threshold(name: str, defaults: Mapping[str, Any]) -> float:
+    """Return the threshold at which random robots get as much human time as C.U.R. asked for.
+
+    Each of N robots asks with probability 1 - threshold a timestep, and is then helped for t_T timesteps.
+    """
+    num_robots, num_steps, duration = (
+        defaults.get(field, getattr(Config, field)) for field in ("num_robots", "num_steps", "min_teleop_time")
+    )
+    return 1 - envs.CUR_HUMAN_TIME[name] / (num_robots * num_steps * duration)
 
 
 def validate(config: Config, env: "envs.Env | None" = None) -> None:

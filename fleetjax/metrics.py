@@ -55,6 +55,6 @@ def rohe(metrics: Metrics, config: Config, time_unit: float = 100) -> jax.Array:
 
     Reference: paper, Equation 2 and Section 5.1.
     """
-    successes = jnp.cumsum(metrics.successes, axis=-1)
-    human_time = jnp.cumsum(metrics.human_steps, axis=-1) / time_unit
-    return (config.num_humans / config.num_robots) * successes / (1.0 + human_time)
+    # f32 is exact up to 2^24, and beyond i32 there are fleets that count on.
+    successes, human_steps = (jnp.cumsum(x, axis=-1, dtype=jnp.float32) for x in (metrics.successes, metrics.human_steps))
+    return (config.num_humans / config.num_robots) * successes / (1.0 + human_steps / time_unit)

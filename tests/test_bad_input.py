@@ -3,6 +3,7 @@
 import pytest
 from commands import contents, refused
 
+from fleetjax.config import Config
 from fleetjax.io import folder
 
 RUN = ("run", "navigation")
@@ -66,6 +67,11 @@ def test_bad_parameters_cost_one_line_and_touch_nothing(name, capsys, tmp_path):
 )
 def test_other_commands_refuse_in_one_line(arguments, reason, capsys):
     assert reason in refused(capsys, *arguments)
+
+
+def test_integers_beyond_32_bits_are_refused():
+    with pytest.raises(ValueError, match="initial_period = 1099511627776 must lie within 32 bits"):
+        Config().replace(initial_period=2**40)
 
 
 def test_a_disk_that_fails_costs_one_line(monkeypatch, tmp_path, capsys):

@@ -62,6 +62,8 @@ def test_semantic_14_rohe_is_successes_per_hundred_human_steps_scaled_by_the_tea
     config = fleetjax.make_config("navigation", num_robots=100, num_humans=10)
     np.testing.assert_allclose(fleetjax.rohe(metrics, config), [0.1 / 1.5, 0.1 / 2, 0.3 / 2], rtol=1e-6)
     np.testing.assert_allclose(fleetjax.rohe(metrics, config, time_unit=1), [0.1 / 51, 0.1 / 101, 0.3 / 101], rtol=1e-6)
+    many = metrics._replace(human_steps=np.full(3, 2**30, np.int32))  # their sum is beyond 32 bits
+    np.testing.assert_allclose(fleetjax.rohe(many, config)[2], 0.3 / (1 + 3 * 2**30 / 100), rtol=1e-6)
 
 
 def test_semantic_16_orders_are_lexicographic():

@@ -13,8 +13,9 @@ import csv
 import functools
 import json
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,29 +26,92 @@ from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks, train
 from flax import linen, serialization
 
-from fleetjax.envs import Env, humanoid
+from fleetjax.envs import Env, anymal, humanoid
 from fleetjax.supervisors import expert
+from fleetjax.types import EnvState
 
 PACKAGE_WEIGHTS = Path(expert.__file__).parent / "weights"
 
-# Environments by name: how to make one, and the return below which no episode succeeds.
-TASKS = {"humanoid": (humanoid.make_env, humanoid.SUCCESS_FLOOR)}
 
-# Hyper-parameters of each task; the rest are brax's defaults.
-SETTINGS: dict[str, dict[str, Any]] = {
-    "humanoid": {
-        "num_envs": 1024,
-        "unroll_length": 16,
-        "batch_size": 64,
-        "num_minibatches": 32,
-        "num_updates_per_batch": 4,
-        "learning_rate": 3e-4,
-        "clipping_epsilon": 0.3,
-        "entropy_cost": 1e-3,
-        "discounting": 0.97,
-        "reward_scaling": 0.1,
-        "max_grad_norm": 1.0,
-    },
+class Training(NamedTuple):
+    """How an expert is trained and judged.
+
+    Attributes:
+        make_env: builds the environment; `success_return` is a keyword.
+        success_floor: the return below which no episode succeeds.
+        measure: name of what is reported beside the return, and `EnvState -> f32[]`, averaged over steps.
+        reward: `(before, after) -> f32[]`, what PPO sees in place of the task's reward.
+        vary: `(EnvState, key) -> EnvState`, a disturbance before each training step.
+        settings: hyper-parameters of PPO; the rest are brax's defaults.
+    """
+
+    make_env: Callable[..., Env]
+    success_floor: float
+    measure: tuple[str, Callable[[EnvState], jax.Array]]
+    settings: dict[str, Any]
+    reward: Callable[[EnvState, EnvState], jax.Array] = lambda before, after: after.reward
+    vary: Callable[[EnvState, jax.Array], EnvState] = lambda state, key: state
+
+
+def smooth_walking(before: EnvState, after: EnvState) -> jax.Array:
+    """Return ANYmal's reward, less a little for actions that change from one step to the next, against trembling."""
+    return after.reward - 5e-4 * jnp.sum((after.obs[36:] - before.obs[36:]) ** 2)
+
+
+def change_command(state: EnvState, key: jax.Array) -> EnvState:
+    """Give ANYmal another command now and then, every 250 steps in the mean."""
+    key_when, key_what = jax.random.split(key)
+    command = jax.random.uniform(key_what, (3,), minval=-1.0, maxval=1.0) * anymal.COMMAND_RANGE
+    walker = state.physics
+    command = jnp.where(jax.random.uniform(key_when) < 1 / 250, command, walker.command)
+    walker = walker._replace(command=command)
+    return state._replace(physics=walker, obs=anymal.observe(walker, state.obs[36:]))
+
+
+TRAININGS = {
+    "anymal": Training(
+        make_env=anymal.make_env,
+        success_floor=anymal.SUCCESS_FLOOR,
+        measure=("mean_tracking_error", anymal.tracking_error),
+        reward=smooth_walking,
+        vary=change_command,
+        settings={
+            "num_envs": 1024,
+            "unroll_length": 24,
+            "batch_size": 256,
+            "num_minibatches": 4,
+            "num_updates_per_batch": 5,
+            "learning_rate": 1e-3,
+            "learning_rate_schedule": "ADAPTIVE_KL",
+            "desired_kl": 0.01,
+            "clipping_epsilon": 0.2,
+            "entropy_cost": 1e-3,
+            "discounting": 0.99,
+            "reward_scaling": 15.0,
+            "max_grad_norm": 1.0,
+            "num_resets_per_eval": 1,
+            "episode_length": 1000,
+        },
+    ),
+    "humanoid": Training(
+        make_env=humanoid.make_env,
+        success_floor=humanoid.SUCCESS_FLOOR,
+        measure=("mean_forward_speed", humanoid.forward_speed),
+        settings={
+            "num_envs": 1024,
+            "unroll_length": 16,
+            "batch_size": 64,
+            "num_minibatches": 32,
+            "num_updates_per_batch": 4,
+            "learning_rate": 3e-4,
+            "clipping_epsilon": 0.3,
+            "entropy_cost": 1e-3,
+            "discounting": 0.97,
+            "reward_scaling": 0.1,
+            "max_grad_norm": 1.0,
+            "episode_length": humanoid.HORIZON,
+        },
+    ),
 }
 make_networks = functools.partial(
     networks.make_ppo_networks,
@@ -68,8 +132,9 @@ if not hasattr(jax, "device_put_replicated"):  # brax 0.14.2 calls it; jax 0.10 
 class Task(BraxEnv):
     """A fleetjax environment as brax sees it; brax's own wrappers reset it and cut its episodes."""
 
-    def __init__(self, env: Env):
-        self.env = env
+    def __init__(self, training: Training):
+        self.env = training.make_env(success_return=float("inf"))
+        self.training = training
 
     def reset(self, rng: jax.Array) -> State:
         """Start an episode."""
@@ -78,11 +143,12 @@ class Task(BraxEnv):
 
     def step(self, state: Any, action: jax.Array) -> State:
         """Take one control step; a violation ends the episode."""
-        key_next, key_step = jax.random.split(state.info["key"])
-        after = self.env.step(state.pipeline_state, action, jnp.bool_(True), key_step)
-        done = after.violation.astype(jnp.float32)
+        key_next, key_vary, key_step = jax.random.split(state.info["key"], 3)
+        before = self.training.vary(state.pipeline_state, key_vary)
+        after = self.env.step(before, action, jnp.bool_(True), key_step)
+        reward, done = self.training.reward(before, after), after.violation.astype(jnp.float32)
         info = {**state.info, "key": key_next}
-        return state.replace(pipeline_state=after, obs=after.obs, reward=after.reward, done=done, info=info)
+        return state.replace(pipeline_state=after, obs=after.obs, reward=reward, done=done, info=info)
 
     @property
     def observation_size(self) -> int:
@@ -118,7 +184,7 @@ def train_expert(
 ) -> None:
     """Train until `num_timesteps` in all, from the last checkpoint if there is one."""
     folder.mkdir(parents=True, exist_ok=True)
-    task = Task(TASKS[name][0](success_return=float("inf")))
+    task = Task(TRAININGS[name])
     done, restore = 0, None
     if checkpoints(folder):
         last = checkpoints(folder)[-1]
@@ -154,13 +220,12 @@ def train_expert(
         )
 
     remaining = num_timesteps - done
-    settings = dict(SETTINGS[name])
+    settings = dict(TRAININGS[name].settings)
     if learning_rate is not None:
         settings["learning_rate"] = learning_rate
     train.train(
         environment=task,
         num_timesteps=remaining,
-        episode_length=task.env.spec.horizon,
         normalize_observations=True,
         network_factory=make_networks,
         num_evals=max(2, 1 + remaining // evaluate_every),
@@ -194,13 +259,14 @@ def ship(name: str, folder: Path, *, candidates: int, num_episodes: int) -> None
     """
     with (folder / "curve.csv").open() as file:
         curve = {int(row["steps"]): float(row["episode_return"]) for row in csv.DictReader(file)}
-    task = Task(TASKS[name][0](success_return=float("inf")))
+    training = TRAININGS[name]
+    task, (label, measure) = Task(training), training.measure
     ranked = sorted(checkpoints(folder), key=lambda path: -curve.get(int(path.stem.split("_")[1]), -np.inf))
     best = None
     for path in ranked[:candidates]:
         weights = as_weights(serialization.from_bytes(template(task), path.read_bytes()))
-        score = jax.jit(lambda w, key: expert.score(task.env, w, num_episodes=num_episodes, key=key))
-        returns, lengths = map(np.asarray, score(weights, jax.random.key(1)))
+        score = jax.jit(lambda w, key: expert.score(task.env, w, measure, num_episodes=num_episodes, key=key))
+        returns, lengths, measured = map(np.asarray, score(weights, jax.random.key(1)))
         full = lengths == task.env.spec.horizon
         mean = float(returns[full].mean()) if full.any() else float("nan")
         record = {
@@ -210,7 +276,8 @@ def ship(name: str, folder: Path, *, candidates: int, num_episodes: int) -> None
             "mean_return": round(float(returns.mean()), 1),
             "mean_return_full_length": round(mean, 1),
             "share_full_length": round(float(full.mean()), 4),
-            "share_successful": round(float((full & (returns > max(TASKS[name][1], 0.95 * mean))).mean()), 4),
+            "share_successful": round(float((full & (returns > max(training.success_floor, 0.95 * mean))).mean()), 4),
+            label: round(float(measured.sum() / lengths.sum()), 3),
         }
         print(record, flush=True)
         if best is None or record["share_successful"] > best[0]["share_successful"]:
@@ -226,7 +293,7 @@ def ship(name: str, folder: Path, *, candidates: int, num_episodes: int) -> None
 def main() -> None:
     """Parse the command line and train or ship."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("environment", choices=sorted(SETTINGS))
+    parser.add_argument("environment", choices=sorted(TRAININGS))
     parser.add_argument("--output", type=Path, help="folder of checkpoints (default: runs/experts/ENVIRONMENT)")
     parser.add_argument("--num-timesteps", type=int, default=40_000_000, help="environment steps in all")
     parser.add_argument("--evaluate-every", type=int, default=1_000_000, help="environment steps between evaluations")

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fleetjax.envs import base
+from fleetjax.envs.rotation import rotation_matrix
 from fleetjax.physics.base import Physics, PhysicsState, make_physics
 from fleetjax.types import EnvState
 
@@ -102,16 +103,9 @@ def observe(joints: _Joints, body: PhysicsState, action: jax.Array) -> jax.Array
     )
 
 
-def rotation_matrix(quaternion: jax.Array) -> jax.Array:
-    """Return the rotation f32[3, 3] from body to world of a unit quaternion f32[4] (w, x, y, z)."""
-    w, x, y, z = quaternion
-    return jnp.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+def forward_speed(state: EnvState) -> jax.Array:
+    """Return the torso's velocity along the axis to the target, f32[] (m/s)."""
+    return state.physics.qvel[0]
 
 
 def _reward(joints: _Joints, physics: Physics, before: PhysicsState, after: PhysicsState, obs, action) -> jax.Array:

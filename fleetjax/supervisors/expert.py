@@ -6,7 +6,7 @@ tanh behind the last) and a JSON of its measured returns; `experiments/train_exp
 
 import functools
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib import resources
 
 import jax
@@ -56,26 +56,39 @@ def policy(weights: Mapping[str, jax.Array | np.ndarray], obs: jax.Array) -> jax
 
 
 def score(
-    env: Env, weights: Mapping[str, jax.Array | np.ndarray], *, num_episodes: int, key: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+    env: Env,
+    weights: Mapping[str, jax.Array | np.ndarray],
+    measure: Callable[[EnvState], jax.Array],
+    *,
+    num_episodes: int,
+    key: jax.Array,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Run one episode a robot under a policy.
 
     Args:
         env: the environment.
         weights: arrays of the policy.
+        measure: `EnvState -> f32[]`, what to add up over an episode's steps.
         num_episodes: robots that run side by side.
         key: random key.
 
     Returns:
-        f32[num_episodes] undiscounted returns, i32[num_episodes] control steps before violation or horizon.
+        f32[num_episodes] undiscounted returns, i32[num_episodes] control steps before violation or horizon,
+        f32[num_episodes] sums of the measure.
     """
     key_reset, key_step = jax.random.split(key)
     start = jax.vmap(env.reset)(jax.random.split(key_reset, num_episodes), jnp.arange(num_episodes))
 
-    def step(state: EnvState, key: jax.Array) -> tuple[EnvState, None]:
+    def step(carry: tuple[EnvState, jax.Array], key: jax.Array) -> tuple[tuple[EnvState, jax.Array], None]:
+        state, total = carry
+        key_env, key_goal = jax.random.split(key)
         active = ~state.violation
-        after = jax.vmap(env.step)(state, policy(weights, state.obs), active, jax.random.split(key, num_episodes))
-        return tree.where(active, after, state), None
+        after = jax.vmap(env.step)(state, policy(weights, state.obs), active, jax.random.split(key_env, num_episodes))
+        total += jnp.where(active, jax.vmap(measure)(after), 0.0)
+        if env.next_goal:
+            after = tree.where(after.success, jax.vmap(env.next_goal)(after, jax.random.split(key_goal, num_episodes)), after)
+        return (tree.where(active, after, state), total), None
 
-    state, _ = jax.lax.scan(step, start, jax.random.split(key_step, env.spec.horizon))
-    return state.episode_return, state.episode_step
+    keys = jax.random.split(key_step, env.spec.horizon)
+    (state, total), _ = jax.lax.scan(step, (start, jnp.zeros(num_episodes)), keys)
+    return state.episode_return, state.episode_step, total

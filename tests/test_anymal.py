@@ -212,9 +212,11 @@ def test_base_and_thighs_must_not_touch_the_floor(physics, env, step, height, an
     fore, hind = np.array(angles), np.array(angles) * (1, -1, -1)
     placed = walker(physics, position=(0, 0, height), angles=np.concatenate([fore, hind, fore, hind]))
     state = env.reset(jax.random.key(0), jnp.int32(0))
-    after = step(state._replace(physics=placed), jnp.zeros(12))
-    assert bool(after.violation) == violates
-    assert not after.success
+    state, violated = state._replace(physics=placed), False
+    for _ in range(10):  # the floor may first push out what was placed a little inside of it
+        state = step(state, jnp.zeros(12))
+        violated |= bool(state.violation)
+    assert violated == violates
 
 
 def test_a_robot_that_holds_its_pose_reaches_the_horizon_and_fails(env, step):

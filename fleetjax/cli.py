@@ -1,4 +1,4 @@
-"""The command line: `fleetjax run`, `list`, `plot` and `evaluate`.
+"""The command line: `fleetjax run`, `list`, `plot`, `evaluate` and `render`.
 
 What cannot be used is refused with one line on stderr and exit code 2, before anything is computed.
 """
@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         int: exit code: 0, 2 for input that cannot be used, 130 after Ctrl-C.
     """
-    commands = {"run": _run, "list": _list, "plot": _plot, "evaluate": _evaluate}
+    commands = {"run": _run, "list": _list, "plot": _plot, "evaluate": _evaluate, "render": _render}
     try:
         arguments = flags.parse(sys.argv[1:] if argv is None else argv)
         commands[arguments.command](arguments)
@@ -182,6 +182,38 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     content = {"num_steps": config.num_steps, "seed": seed, "totals": total, "versions": folder.versions()}
     folder.write_json(output, content)
     print(text.evaluation_table(metrics, config))
+
+
+def _render(arguments: argparse.Namespace) -> None:
+    from fleetjax.io import render
+
+    path = Path(arguments.source)
+    with _refusing():
+        for name in ("num_shown", "num_steps", "every", "width"):
+            if getattr(arguments, name) < 1:
+                raise ValueError(f"{name} = {getattr(arguments, name)} must be at least 1")
+        render.check_format(arguments.output)
+        run = None if arguments.source in list_envs() else folder.read_run(path)
+        policy = arguments.policy or ("robot" if run else "expert")
+        if policy == "robot" and run is None:
+            raise ValueError(f"--policy robot needs a run folder, and {arguments.source} is an environment")
+        config = run.config if run else make_config(arguments.source, "cur")
+        scene = render.scene_of(config)
+        if policy == "expert":
+            shown = {"num_robots": arguments.num_shown, "num_humans": arguments.num_shown}
+            config = make_config(config.environment, "expert", **shown, backend=config.backend)
+        learner = folder.read_policy(run) if run and policy == "robot" else None
+    folder.check_free(arguments.output, overwrite=arguments.overwrite)
+    key = jax.random.key(arguments.seed if arguments.seed is not None else run.seed if run else 0)
+    say(f"{text.headline(config, 0).rsplit(',', 1)[0]}, policy {policy}: running ...")
+    config, state = render.start(config, key, learner, skip=arguments.skip)
+    film = render.shoot(config.replace(num_steps=arguments.num_steps), key, state, num_shown=arguments.num_shown)
+    say("drawing ...")
+    pictures = render.draw(film, scene, width=arguments.width, height=3 * arguments.width // 4, every=arguments.every)
+    rate = 1 / (envs.make(config.environment, config.backend).spec.control_step * arguments.every)
+    with _refusing():
+        folder.write(arguments.output, render.encode(pictures, arguments.output, rate=rate))
+    print(arguments.output)
 
 
 _EVALUATED = ("successes", "violations", "hard_resets", "idle", "human_steps", "moving", "reward")

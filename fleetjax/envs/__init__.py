@@ -7,11 +7,12 @@ from typing import Any, NamedTuple
 import jax
 
 from fleetjax.envs.adapters import from_brax, from_playground
-from fleetjax.envs.base import Env, EnvSpec, begin, proceed
+from fleetjax.envs.base import Env, EnvSpec, Scene, begin, proceed
 
 __all__ = [
     "Env",
     "EnvSpec",
+    "Scene",
     "begin",
     "from_brax",
     "from_playground",

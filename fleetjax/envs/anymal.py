@@ -71,7 +71,7 @@ def make_env(*, backend: str = "auto", success_return: float | None = None) -> b
     def step(state: EnvState, action: jax.Array, active: jax.Array, key: jax.Array) -> EnvState:
         del key  # deterministic
         action = jnp.clip(action, -1.0, 1.0)
-        target = DEFAULT_ANGLES + ACTION_SCALE * action
+        target = jnp.asarray(DEFAULT_ANGLES) + ACTION_SCALE * action
         walker = state.physics._replace(body=physics.step(state.physics.body, target, active))
         violation = jnp.any(walker.body.sensors > CONTACT_FORCE) | walker.body.diverged
         return base.proceed(
@@ -84,7 +84,7 @@ def make_env(*, backend: str = "auto", success_return: float | None = None) -> b
             success_return=success_return,
         )
 
-    return base.Env(reset, step, spec)
+    return base.Env(reset, step, spec, scene=base.Scene(physics.model, lambda state: state.physics.body.qpos))
 
 
 def base_velocity(body: PhysicsState) -> tuple[jax.Array, jax.Array]:

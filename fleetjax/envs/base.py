@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 
 from fleetjax.types import EnvState
 
@@ -33,6 +34,18 @@ class EnvSpec(NamedTuple):
     supervisor: str = ""
 
 
+class Scene(NamedTuple):
+    """How an environment is drawn.
+
+    Attributes:
+        model: MuJoCo model with a camera named `track`.
+        pose: `EnvState -> f32[nq]`, positions of its joints.
+    """
+
+    model: mujoco.MjModel
+    pose: Callable[[EnvState], jax.Array]
+
+
 class Env(NamedTuple):
     """Pure functions of one robot's task. It never resets itself: that is what fleets compete for.
 
@@ -43,12 +56,14 @@ class Env(NamedTuple):
         spec: static facts.
         next_goal: `(EnvState, key) -> EnvState` draws a new goal after a success and lets the episode go on;
             None if a success ends the episode.
+        scene: how to draw it; None if there is nothing to see.
     """
 
     reset: Callable[[jax.Array, jax.Array], EnvState]
     step: Callable[[EnvState, jax.Array, jax.Array, jax.Array], EnvState]
     spec: EnvSpec
     next_goal: Callable[[EnvState, jax.Array], EnvState] | None = None
+    scene: Scene | None = None
 
 
 def begin(physics: Any, obs: jax.Array) -> EnvState:

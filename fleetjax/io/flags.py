@@ -60,6 +60,12 @@ class _Parser(argparse.ArgumentParser):
         return f"unknown flag {flag}; the closest is {close[0]}"
 
 
+_RENDER_ABOUT = """Draw robots as an animation, a grid of tiles. Who is teleoperated is tinted blue, who is in violation red.
+
+expert: the supervisor acts on every robot. robot: the trained policy of a run acts, and nobody teleoperates. mixed: the fleet
+as it runs, from its pre-training on, with humans who come to help."""
+
+
 def parse(argv: Sequence[str]) -> argparse.Namespace:
     """Return the arguments; fields of `Config` are there only if they were given.
 
@@ -94,6 +100,23 @@ def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser
     evaluate.add_argument("--num-steps", metavar="N", type=_integer, default=10_000, help="timesteps [default: 10000]")
     evaluate.add_argument("--seed", metavar="N", type=_seed, help="random seed [default: the run's, plus 1]")
     evaluate.add_argument("--overwrite", action="store_true", help="replace the evaluation in the run folder")
+
+    render = commands.add_parser("render", help="draw robots as an animation", description=_RENDER_ABOUT)
+    render.add_argument("source", metavar="RUN|ENV", help="run folder, or environment")
+    policies = ("expert", "robot", "mixed")
+    render.add_argument("--policy", choices=policies, help="who acts [default: robot for a run, expert for an environment]")
+    render.add_argument("--num-shown", metavar="N", type=_integer, default=4, help="robots in the picture [default: 4]")
+    render.add_argument("--num-steps", metavar="N", type=_integer, default=200, help="timesteps to draw [default: 200]")
+    render.add_argument("--skip", metavar="N", type=_integer, default=0, help="timesteps to run before them [default: 0]")
+    render.add_argument("--every", metavar="N", type=_integer, default=2, help="timesteps a picture [default: 2]")
+    render.add_argument(
+        "--width", metavar="N", type=_integer, default=320, help="width of a robot's tile (pixels) [default: 320]"
+    )
+    render.add_argument("--seed", metavar="N", type=_seed, help="random seed [default: the run's, or 0]")
+    render.add_argument(
+        "--output", metavar="FILE", type=Path, default=Path("fleetjax.gif"), help="gif or mp4 [default: fleetjax.gif]"
+    )
+    render.add_argument("--overwrite", action="store_true", help="replace an existing file")
     return parser, list(commands.choices)
 
 

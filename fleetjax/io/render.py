@@ -1,0 +1,185 @@
+"""Moving pictures of a fleet: a grid of robots, each with its own camera, tinted under teleoperation or in violation."""
+
+import contextlib
+import importlib.util
+import io
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import mujoco
+import numpy as np
+
+from fleetjax import envs
+from fleetjax.allocation import helper_of
+from fleetjax.config import Config
+from fleetjax.fleet import FleetState, make_fleet
+from fleetjax.learning.imitation import LearnerState
+from fleetjax.run import evaluate, prepare, run
+
+FORMATS = (".gif", ".mp4")
+CAMERA = "track"  # that every model has
+TELEOPERATED, VIOLATING = (0.1, 0.45, 0.9), (0.9, 0.25, 0.1)  # red, green, blue
+NEED_GL = (
+    "no OpenGL library for drawing without a screen; install one of Debian's packages libegl1 (with libgl1-mesa-dri) or "
+    "libosmesa6, or what your system calls them"
+)
+
+
+class Film(NamedTuple):
+    """What there is to see, in numpy arrays.
+
+    Attributes:
+        pose: f32[T, K, nq] positions of the joints.
+        violating: bool[T, K].
+        teleoperated: bool[T, K].
+    """
+
+    pose: np.ndarray
+    violating: np.ndarray
+    teleoperated: np.ndarray
+
+
+def check_format(path: Path) -> None:
+    """Check that films can be written to such a file.
+
+    Raises:
+        ValueError: if the format is unknown, or its writer is not installed.
+    """
+    if path.suffix.lower() not in FORMATS:
+        raise ValueError(f"{path} must end in one of {', '.join(FORMATS)}")
+    if path.suffix.lower() == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise ValueError(f'{path} needs imageio with ffmpeg: pip install "fleetjax[video]", or choose a .gif')
+
+
+def scene_of(config: Config) -> envs.Scene:
+    """Return how the environment is drawn.
+
+    Raises:
+        ValueError: if it has nothing to draw.
+    """
+    scene = envs.make(config.environment, config.backend).scene
+    if scene is None:
+        raise ValueError(f"environment = {config.environment!r} has no bodies to draw; choose one with physics")
+    return scene
+
+
+def start(config: Config, key: jax.Array, learner: LearnerState | None, *, skip: int) -> tuple[Config, FleetState]:
+    """Return the state in which a film begins, and the configuration to go on with.
+
+    Args:
+        config: configuration.
+        key: random key.
+        learner: a trained policy that acts alone; None pre-trains, and humans help.
+        skip: timesteps to run first.
+    """
+    if learner is not None:
+        state = jax.jit(evaluate)(config.replace(num_steps=max(1, skip)), key, learner).state
+        return config.replace(algorithm="constraint"), state
+    state = jax.jit(prepare)(config, key)
+    return config, jax.jit(run)(config.replace(num_steps=skip), key, state).state if skip else state
+
+
+def shoot(config: Config, key: jax.Array, state: FleetState, *, num_shown: int) -> Film:
+    """Run `config.num_steps` timesteps from `state`, as `fleetjax.run` does, and keep what the first robots look like."""
+    env, scene = envs.make(config.environment, config.backend), scene_of(config)
+    fleet = make_fleet(config, env)
+    _, key_steps = jax.random.split(key)
+
+    def timestep(state: FleetState, _: None):
+        after, _metrics = fleet.step(state, jax.random.fold_in(key_steps, state.timestep))
+        helped = helper_of(after.humans, config.num_robots) >= 0
+        seen = jax.tree.map(lambda x: x[:num_shown], (state.env, helped & ~after.resetting))
+        return after, (jax.vmap(scene.pose)(seen[0]), seen[0].violation, seen[1])
+
+    film = jax.jit(lambda state: jax.lax.scan(timestep, state, length=config.num_steps)[1])
+    return Film(*jax.device_get(film(state)))
+
+
+def draw(film: Film, scene: envs.Scene, *, width: int, height: int, every: int) -> Iterator[np.ndarray]:
+    """Yield a picture u8[H, W, 3] of every `every`-th timestep: a grid of tiles of `width` x `height` pixels.
+
+    Raises:
+        ValueError: if no OpenGL library is found.
+    """
+    columns = int(np.ceil(np.sqrt(film.pose.shape[1])))
+    with _painter(scene.model, width, height) as paint:
+        for t in range(0, len(film.pose), every):
+            tiles = [paint(*robot) for robot in zip(film.pose[t], film.violating[t], film.teleoperated[t], strict=True)]
+            tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % columns)
+            yield np.vstack([np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)])
+
+
+@contextlib.contextmanager
+def _painter(model: mujoco.MjModel, width: int, height: int) -> Iterator[Callable[..., np.ndarray]]:
+    """Yield a function from a pose and the robot's two marks to a picture."""
+    context = _gl_context(width, height)
+    context.make_current()
+    plain = model.geom_rgba.copy()
+    robot = model.geom_bodyid > 0
+    model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+    data, scene = mujoco.MjData(model), mujoco.MjvScene(model, maxgeom=model.ngeom + 100)
+    target = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, target)
+    camera, options = mujoco.MjvCamera(), mujoco.MjvOption()
+    camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED.value, model.camera(CAMERA).id
+    place = mujoco.MjrRect(0, 0, width, height)
+    pixels = np.empty((height, width, 3), np.uint8)
+
+    def paint(pose: np.ndarray, violating: bool, teleoperated: bool) -> np.ndarray:
+        data.qpos[:] = pose
+        model.geom_rgba[:] = plain
+        if violating or teleoperated:
+            model.geom_rgba[robot, :3] = 0.3 * plain[robot, :3] + 0.7 * np.array(VIOLATING if violating else TELEOPERATED)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_camlight(model, data)
+        mujoco.mjv_updateScene(model, data, options, None, camera, mujoco.mjtCatBit.mjCAT_ALL.value, scene)
+        mujoco.mjr_render(place, scene, target)
+        mujoco.mjr_readPixels(pixels, None, place, target)
+        return pixels[::-1].copy()
+
+    try:
+        yield paint
+    finally:
+        model.geom_rgba[:] = plain
+        target.free()
+        context.free()
+
+
+def _gl_context(width: int, height: int) -> Any:
+    """Return an OpenGL context for drawing without a screen: EGL, else OSMesa; MUJOCO_GL picks one.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    wanted = os.environ.get("MUJOCO_GL", "").lower()
+    for name in [wanted] if wanted in ("egl", "osmesa") else ["egl", "osmesa"]:
+        with contextlib.suppress(ImportError, AttributeError, RuntimeError, OSError):
+            return importlib.import_module(f"mujoco.{name}").GLContext(width, height)
+    raise ValueError(NEED_GL)
+
+
+def encode(pictures: Iterator[np.ndarray], path: Path, *, rate: float) -> bytes:
+    """Return a film as the bytes of a gif or an mp4, by the suffix of `path`.
+
+    Args:
+        pictures: u8[H, W, 3] each.
+        path: where it will go.
+        rate: pictures a second.
+    """
+    if path.suffix.lower() == ".gif":
+        from PIL import Image
+
+        # One palette for all pictures: else the colours flicker.
+        first, *others = [Image.fromarray(picture) for picture in pictures]
+        palette = first.quantize(128)
+        frames = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in (first, *others)]
+        data = io.BytesIO()
+        frames[0].save(data, "gif", save_all=True, append_images=frames[1:], duration=max(20, round(1000 / rate)), loop=0)
+        return data.getvalue()
+    import imageio.v3  # pyright: ignore[reportMissingImports]  an extra
+
+    return imageio.v3.imwrite("<bytes>", list(pictures), extension=".mp4", fps=rate, codec="libx264", macro_block_size=2)

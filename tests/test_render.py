@@ -1,0 +1,112 @@
+"""Animations: who is drawn, in which colour, and what is refused."""
+
+import io
+
+import jax
+import numpy as np
+import pytest
+from commands import refused
+from PIL import Image
+
+import fleetjax
+from fleetjax import cli, envs
+from fleetjax.io import render
+
+WIDTH, HEIGHT = 96, 72
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return envs.make("humanoid").scene
+
+
+def can_draw() -> bool:
+    try:
+        render._gl_context(16, 16).free()
+    except ValueError:
+        return False
+    return True
+
+
+needs_gl = pytest.mark.skipif(not can_draw(), reason=render.NEED_GL)
+
+
+def film(scene, *, violating, teleoperated):
+    """Return a film of one timestep: robots that stand, with the given marks."""
+    pose = np.broadcast_to(scene.model.qpos0, (1, len(violating), scene.model.nq))
+    return render.Film(pose, np.array([violating]), np.array([teleoperated]))
+
+
+@needs_gl
+def test_marks_are_colours(scene):
+    marks = {"violating": [False, True, False], "teleoperated": [False, False, True]}
+    (picture,) = render.draw(film(scene, **marks), scene, width=WIDTH, height=HEIGHT, every=1)
+    assert picture.shape == (2 * HEIGHT, 2 * WIDTH, 3)
+    plain, red, blue, empty = (picture[i : i + HEIGHT, j : j + WIDTH].astype(int) for i in (0, HEIGHT) for j in (0, WIDTH))
+    assert np.all(empty == 255)
+    robot = np.any(plain != red, axis=2) | np.any(plain != blue, axis=2)
+    assert 0.005 < robot.mean() < 0.5  # the robots, and nothing else, look different
+    assert red[robot, 0].mean() > red[robot, 2].mean() + 30
+    assert blue[robot, 2].mean() > blue[robot, 0].mean() + 30
+
+
+@needs_gl
+def test_bodies_are_drawn_where_they_are(scene):
+    standing = film(scene, violating=[False], teleoperated=[False])
+    lying = standing.pose.copy()
+    lying[..., 2:7] = 0.1, np.sqrt(0.5), 0, np.sqrt(0.5), 0
+    pictures = [
+        next(render.draw(x, scene, width=WIDTH, height=HEIGHT, every=1)) for x in (standing, standing._replace(pose=lying))
+    ]
+    assert np.mean(pictures[0] != pictures[1]) > 0.01
+    again = next(render.draw(standing, scene, width=WIDTH, height=HEIGHT, every=1))
+    np.testing.assert_array_equal(again, pictures[0])
+
+
+def test_a_film_is_that_of_the_run():
+    small = {"num_robots": 3, "num_humans": 3, "num_steps": 4}
+    config = fleetjax.make_config("humanoid", "expert", **small)
+    key = jax.random.key(3)
+    _, state = render.start(config, key, None, skip=2)
+    shot = render.shoot(config, key, state, num_shown=2)
+    expected = jax.jit(fleetjax.run)(
+        config.replace(num_steps=5), key
+    ).state  # the last picture is taken before the last timestep
+    assert shot.pose.shape == (4, 2, 28)
+    np.testing.assert_array_equal(shot.pose[-1], expected.env.physics.qpos[:2])
+    assert shot.teleoperated.all()
+    assert not shot.violating.any()
+
+
+@needs_gl
+def test_render_writes_a_gif(tmp_path, capsys):
+    path = tmp_path / "robots.gif"
+    few = ("--num-shown", "2", "--num-steps", "5", "--every", "2", "--width", "64")
+    assert cli.main(["render", "humanoid", *few, "--output", str(path)]) == 0
+    assert capsys.readouterr().out == f"{path}\n"
+    with Image.open(io.BytesIO(path.read_bytes())) as image:
+        assert (image.size, image.n_frames) == ((128, 48), 3)
+    assert "exists already" in refused(capsys, "render", "humanoid", "--output", path)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (("humanoid", "--output", "x.avi"), "x.avi must end in one of .gif, .mp4"),
+        (("humanoid", "--num-shown", 0), "num_shown = 0 must be at least 1"),
+        (("humanoid", "--policy", "robot"), "--policy robot needs a run folder"),
+        (("navigation",), "environment = 'navigation' has no bodies to draw"),
+        (("nowhere",), "nowhere is not a run folder"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(arguments, reason, capsys):
+    assert reason in refused(capsys, "render", *arguments)
+
+
+def test_a_machine_without_opengl_is_told_what_to_install(monkeypatch):
+    def missing(name):
+        raise ImportError(name)
+
+    monkeypatch.setattr(render.importlib, "import_module", missing)
+    with pytest.raises(ValueError, match="libosmesa6"):
+        render._gl_context(16, 16)

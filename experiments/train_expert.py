@@ -26,7 +26,7 @@ from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks, train
 from flax import linen, serialization
 
-from fleetjax.envs import Env, anymal, humanoid
+from fleetjax.envs import Env, allegro_hand, anymal, humanoid
 from fleetjax.supervisors import expert
 from fleetjax.types import EnvState
 
@@ -43,6 +43,7 @@ class Training(NamedTuple):
         reward: `(before, after) -> f32[]`, what PPO sees in place of the task's reward.
         vary: `(EnvState, key) -> EnvState`, a disturbance before each training step.
         settings: hyper-parameters of PPO; the rest are brax's defaults.
+        hidden_sizes: units of the hidden layers of policy and value network.
     """
 
     make_env: Callable[..., Env]
@@ -51,6 +52,7 @@ class Training(NamedTuple):
     settings: dict[str, Any]
     reward: Callable[[EnvState, EnvState], jax.Array] = lambda before, after: after.reward
     vary: Callable[[EnvState, jax.Array], EnvState] = lambda state, key: state
+    hidden_sizes: tuple[int, ...] = (256, 128)
 
 
 def smooth_walking(before: EnvState, after: EnvState) -> jax.Array:
@@ -76,6 +78,27 @@ def change_command(state: EnvState, key: jax.Array) -> EnvState:
 
 
 TRAININGS = {
+    "allegro_hand": Training(
+        make_env=lambda success_return: allegro_hand.make_env(),
+        success_floor=float("inf"),  # goals count, returns do not
+        measure=("goals_per_step", lambda state: state.success.astype(jnp.float32)),
+        hidden_sizes=(512, 256, 128),
+        settings={
+            "num_envs": 1024,
+            "unroll_length": 16,
+            "batch_size": 64,
+            "num_minibatches": 32,
+            "num_updates_per_batch": 4,
+            "learning_rate": 3e-4,
+            "clipping_epsilon": 0.2,
+            "entropy_cost": 2e-3,
+            "discounting": 0.99,
+            "reward_scaling": 0.01,
+            "max_grad_norm": 1.0,
+            "num_resets_per_eval": 1,
+            "episode_length": allegro_hand.HORIZON,
+        },
+    ),
     "anymal": Training(
         make_env=anymal.make_env,
         success_floor=anymal.SUCCESS_FLOOR,
@@ -118,12 +141,17 @@ TRAININGS = {
         },
     ),
 }
-make_networks = functools.partial(
-    networks.make_ppo_networks,
-    policy_hidden_layer_sizes=(256, 128),
-    value_hidden_layer_sizes=(256, 128),
-    activation=linen.elu,
-)
+
+
+def network_factory(training: Training) -> Callable[..., networks.PPONetworks]:
+    """Return what builds the policy and value network."""
+    return functools.partial(
+        networks.make_ppo_networks,
+        policy_hidden_layer_sizes=training.hidden_sizes,
+        value_hidden_layer_sizes=training.hidden_sizes,
+        activation=linen.elu,
+    )
+
 
 if not hasattr(jax, "device_put_replicated"):  # brax 0.14.2 calls it; jax 0.10 dropped it (brax issue 671)
 
@@ -148,11 +176,14 @@ class Task(BraxEnv):
 
     def step(self, state: Any, action: jax.Array) -> State:
         """Take one control step; a violation ends the episode."""
-        key_next, key_vary, key_step = jax.random.split(state.info["key"], 3)
+        key_next, key_vary, key_step, key_goal = jax.random.split(state.info["key"], 4)
         before = self.training.vary(state.pipeline_state, key_vary)
         after = self.env.step(before, action, jnp.bool_(True), key_step)
         reward, done = self.training.reward(before, after), after.violation.astype(jnp.float32)
         info = {**state.info, "key": key_next}
+        if self.env.next_goal:
+            renewed = self.env.next_goal(after, key_goal)
+            after = jax.tree.map(lambda new, old: jnp.where(after.success, new, old), renewed, after)
         return state.replace(pipeline_state=after, obs=after.obs, reward=reward, done=done, info=info)
 
     @property
@@ -173,7 +204,7 @@ class Task(BraxEnv):
 
 def template(task: Task):
     """Return parameters of the right structure, to read a checkpoint into."""
-    nets = make_networks(task.observation_size, task.action_size)
+    nets = network_factory(task.training)(task.observation_size, task.action_size)
     key = jax.random.key(0)
     statistics = running_statistics.init_state(specs.Array((task.observation_size,), jnp.dtype("float32")))
     return statistics, nets.policy_network.init(key), nets.value_network.init(key)
@@ -232,7 +263,7 @@ def train_expert(
         environment=task,
         num_timesteps=remaining,
         normalize_observations=True,
-        network_factory=make_networks,
+        network_factory=network_factory(task.training),
         num_evals=max(2, 1 + remaining // evaluate_every),
         deterministic_eval=True,
         num_eval_envs=128,
@@ -260,7 +291,7 @@ def ship(name: str, folder: Path, *, candidates: int, num_episodes: int) -> None
     """Score the most promising checkpoints on fresh episodes and write the best into the package.
 
     Episodes whose return is at least 95 % of the mean over full-length episodes (and the task's floor) succeed;
-    the checkpoint with most successes wins.
+    the checkpoint with most successes wins. Where there are goals, the one that reaches most of them wins.
     """
     with (folder / "curve.csv").open() as file:
         curve = {int(row["steps"]): float(row["episode_return"]) for row in csv.DictReader(file)}
@@ -282,10 +313,11 @@ def ship(name: str, folder: Path, *, candidates: int, num_episodes: int) -> None
             "mean_return_full_length": round(mean, 1),
             "share_full_length": round(float(full.mean()), 4),
             "share_successful": round(float((full & (returns > max(training.success_floor, 0.95 * mean))).mean()), 4),
-            label: round(float(measured.sum() / lengths.sum()), 3),
+            label: round(float(measured.sum() / lengths.sum()), 4),
         }
         print(record, flush=True)
-        if best is None or record["share_successful"] > best[0]["share_successful"]:
+        criterion = label if task.env.next_goal else "share_successful"
+        if best is None or record[criterion] > best[0][criterion]:
             best = (record, weights)
     assert best is not None, f"no checkpoint in {folder}"
     PACKAGE_WEIGHTS.mkdir(exist_ok=True)

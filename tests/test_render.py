@@ -34,7 +34,7 @@ needs_gl = pytest.mark.skipif(not can_draw(), reason=render.NEED_GL)
 def film(scene, *, violating, teleoperated):
     """Return a film of one timestep: robots that stand, with the given marks."""
     pose = np.broadcast_to(scene.model.qpos0, (1, len(violating), scene.model.nq))
-    return render.Film(pose, np.array([violating]), np.array([teleoperated]))
+    return render.Film(pose, np.zeros((1, len(violating), 0, 7)), np.array([violating]), np.array([teleoperated]))
 
 
 @needs_gl

@@ -84,7 +84,9 @@ def make_env(*, backend: str = "auto", success_return: float | None = None) -> b
             success_return=success_return,
         )
 
-    return base.Env(reset, step, spec, scene=base.Scene(physics.model, lambda state: state.physics.body.qpos))
+    return base.Env(
+        reset, step, spec, scene=base.Scene(physics.model, lambda state: (state.physics.body.qpos, jnp.zeros((0, 7))))
+    )
 
 
 def base_velocity(body: PhysicsState) -> tuple[jax.Array, jax.Array]:

@@ -39,11 +39,11 @@ class Scene(NamedTuple):
 
     Attributes:
         model: MuJoCo model with a camera named `track`.
-        pose: `EnvState -> f32[nq]`, positions of its joints.
+        pose: `EnvState -> (f32[nq], f32[nmocap, 7])`, positions of its joints, and of what is only shown.
     """
 
     model: mujoco.MjModel
-    pose: Callable[[EnvState], jax.Array]
+    pose: Callable[[EnvState], tuple[jax.Array, jax.Array]]
 
 
 class Env(NamedTuple):

@@ -57,7 +57,7 @@ def make_env(*, backend: str = "auto", success_return: float | None = None) -> b
             state, physics=body, obs=obs, reward=reward, violation=violation, horizon=HORIZON, success_return=success_return
         )
 
-    return base.Env(reset, step, spec, scene=base.Scene(physics.model, lambda state: state.physics.qpos))
+    return base.Env(reset, step, spec, scene=base.Scene(physics.model, lambda state: (state.physics.qpos, jnp.zeros((0, 7)))))
 
 
 class _Joints:

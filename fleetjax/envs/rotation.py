@@ -14,3 +14,19 @@ def rotation_matrix(quaternion: jax.Array) -> jax.Array:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+def multiply(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Return the product f32[4] of two quaternions: first turn by `b`, then by `a`."""
+    w, x, y, z = a
+    return jnp.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]) @ b
+
+
+def conjugate(quaternion: jax.Array) -> jax.Array:
+    """Return the inverse f32[4] of a unit quaternion."""
+    return quaternion * jnp.array([1.0, -1.0, -1.0, -1.0])
+
+
+def angle_between(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Return by how much two orientations f32[4] differ, f32[] (rad, in [0, pi])."""
+    return 2.0 * jnp.arcsin(jnp.minimum(1.0, jnp.linalg.norm(multiply(a, conjugate(b))[1:])))

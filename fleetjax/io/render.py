@@ -33,11 +33,13 @@ class Film(NamedTuple):
 
     Attributes:
         pose: f32[T, K, nq] positions of the joints.
+        mocap: f32[T, K, nmocap, 7] positions and orientations of what is only shown.
         violating: bool[T, K].
         teleoperated: bool[T, K].
     """
 
     pose: np.ndarray
+    mocap: np.ndarray
     violating: np.ndarray
     teleoperated: np.ndarray
 
@@ -92,7 +94,7 @@ def shoot(config: Config, key: jax.Array, state: FleetState, *, num_shown: int) 
         after, _metrics = fleet.step(state, jax.random.fold_in(key_steps, state.timestep))
         helped = helper_of(after.humans, config.num_robots) >= 0
         seen = jax.tree.map(lambda x: x[:num_shown], (state.env, helped & ~after.resetting))
-        return after, (jax.vmap(scene.pose)(seen[0]), seen[0].violation, seen[1])
+        return after, (*jax.vmap(scene.pose)(seen[0]), seen[0].violation, seen[1])
 
     film = jax.jit(lambda state: jax.lax.scan(timestep, state, length=config.num_steps)[1])
     return Film(*jax.device_get(film(state)))
@@ -107,7 +109,7 @@ def draw(film: Film, scene: envs.Scene, *, width: int, height: int, every: int) 
     columns = int(np.ceil(np.sqrt(film.pose.shape[1])))
     with _painter(scene.model, width, height) as paint:
         for t in range(0, len(film.pose), every):
-            tiles = [paint(*robot) for robot in zip(film.pose[t], film.violating[t], film.teleoperated[t], strict=True)]
+            tiles = [paint(*robot) for robot in zip(*(x[t] for x in film), strict=True)]
             tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % columns)
             yield np.vstack([np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)])
 
@@ -128,8 +130,8 @@ def _painter(model: mujoco.MjModel, width: int, height: int) -> Iterator[Callabl
     place = mujoco.MjrRect(0, 0, width, height)
     pixels = np.empty((height, width, 3), np.uint8)
 
-    def paint(pose: np.ndarray, violating: bool, teleoperated: bool) -> np.ndarray:
-        data.qpos[:] = pose
+    def paint(pose: np.ndarray, mocap: np.ndarray, violating: bool, teleoperated: bool) -> np.ndarray:
+        data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = pose, mocap[:, :3], mocap[:, 3:]
         model.geom_rgba[:] = plain
         if violating or teleoperated:
             model.geom_rgba[robot, :3] = 0.3 * plain[robot, :3] + 0.7 * np.array(VIOLATING if violating else TELEOPERATED)

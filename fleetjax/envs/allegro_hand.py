@@ -1,0 +1,130 @@
+"""Allegro hand: 16 position servos turn a cube to random orientations, one goal after the other (paper, Section 5.1).
+
+Differences from the Isaac Gym task, where a reading of it was unclear or mistaken: joint torques are the servos', not
+readings that are always zero; no joint starts outside its limits; an episode starts with the cube at rest in the hand.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fleetjax.envs import base
+from fleetjax.envs.rotation import angle_between, conjugate, multiply, rotation_matrix
+from fleetjax.physics.base import MODELS, PhysicsState, make_physics
+from fleetjax.types import EnvState
+
+HORIZON = 600
+SUBSTEPS = 4
+GOAL_POSITION = np.array([0.0, -0.2, 0.52], np.float32)  # m
+SHOWN_AT = np.array([-0.2, -0.26, 0.64], np.float32)  # m, where pictures show the goal
+TOLERANCE = 0.1  # rad, within which a goal is reached
+DROP_DISTANCE = 0.24  # m from the goal's position, at which the cube counts as dropped
+STIFFNESS, DAMPING, LARGEST_TORQUE = 3.0, 0.1, 0.5  # N m/rad, N m s/rad, N m
+SETTLED = MODELS / "allegro_hand_settled.npz"  # written by experiments/settle_cubes.py
+
+
+class Hand(NamedTuple):
+    """Hand and cube, and the orientation that the cube is to be turned to.
+
+    Attributes:
+        body: the simulated hand (joints 0 to 15) and cube (a free joint).
+        goal: f32[4] unit quaternion.
+    """
+
+    body: PhysicsState
+    goal: jax.Array
+
+
+def make_env(*, backend: str = "auto") -> base.Env:
+    """Build the environment of hand and cube.
+
+    Args:
+        backend: physics backend.
+    """
+    physics = make_physics("allegro_hand.xml", substeps=SUBSTEPS, backend=backend)
+    spec = base.EnvSpec(
+        "allegro_hand", 88, physics.model.nu, HORIZON, physics.control_step, has_goal=True, supervisor="allegro_hand"
+    )
+    low, high = (jnp.asarray(x, jnp.float32) for x in physics.model.jnt_range[:16].T)
+    with np.load(SETTLED, allow_pickle=False) as arrays:
+        settled = jnp.asarray(arrays["qpos"])
+
+    def reset(key: jax.Array, robot: jax.Array) -> EnvState:
+        del robot  # every robot starts from the same distribution
+        key_start, key_goal = jax.random.split(key)
+        start = settled[jax.random.randint(key_start, (), 0, settled.shape[0])]
+        hand = Hand(physics.initial._replace(qpos=start), draw_orientation(key_goal))
+        action = jnp.clip(2 * (start[:16] - low) / (high - low) - 1, -1.0, 1.0)  # that holds the fingers where they are
+        return base.begin(hand, observe(hand, action, low, high))
+
+    def step(state: EnvState, action: jax.Array, active: jax.Array, key: jax.Array) -> EnvState:
+        del key  # deterministic
+        action = jnp.clip(action, -1.0, 1.0)
+        target = low + (action + 1) / 2 * (high - low)
+        hand = state.physics._replace(body=physics.step(state.physics.body, target, active))
+        distance = jnp.linalg.norm(hand.body.qpos[16:19] - GOAL_POSITION)
+        violation = (distance >= DROP_DISTANCE) | hand.body.diverged
+        angle = angle_between(hand.body.qpos[19:23], hand.goal)
+        success = angle <= TOLERANCE
+        reward = -10.0 * distance + 1.0 / (angle + 0.1) - 2e-4 * jnp.sum(action**2) + 250.0 * success
+        return base.proceed(
+            state,
+            physics=hand,
+            obs=observe(hand, jnp.nan_to_num(action), low, high),  # an action that is no number makes the body diverge
+            reward=jnp.where(hand.body.diverged, 0.0, reward),
+            violation=violation,
+            success=success,
+            horizon=HORIZON,
+        )
+
+    def next_goal(state: EnvState, key: jax.Array) -> EnvState:
+        hand = state.physics._replace(goal=draw_orientation(key))
+        return state._replace(physics=hand, obs=observe(hand, state.obs[72:], low, high))
+
+    def pose(state: EnvState) -> tuple[jax.Array, jax.Array]:
+        return state.physics.body.qpos, jnp.concatenate([SHOWN_AT, state.physics.goal])[None]
+
+    return base.Env(reset, step, spec, next_goal, base.Scene(physics.model, pose))
+
+
+def draw_orientation(key: jax.Array) -> jax.Array:
+    """Return a random orientation f32[4]: a turn about the world's y, then one about its x, each uniform in [-pi, pi]."""
+    half = jnp.pi / 2 * jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0)
+    zero = jnp.zeros(())
+    about_x = jnp.stack([jnp.cos(half[0]), jnp.sin(half[0]), zero, zero])
+    about_y = jnp.stack([jnp.cos(half[1]), zero, jnp.sin(half[1]), zero])
+    return multiply(about_x, about_y)
+
+
+def observe(hand: Hand, action: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
+    """Return the observation f32[88] of a hand to which `action` f32[16] was last applied, clipped to [-5, 5].
+
+    Entries: 0-15 joint angles, limits at -1 and 1; 16-31 joint velocities (rad/s, x 0.2); 32-47 the servos' torques (N m,
+    x 10); cube: 48-50 position (m), 51-54 orientation (x, y, z, w), 55-57 velocity (m/s), 58-60 angular velocity (rad/s,
+    x 0.2), both in the world's frame; goal: 61-63 position (m), 64-67 orientation; 68-71 the turn from goal to cube; 72-87
+    the action.
+    """
+    body = hand.body
+    angles, velocities, orientation = body.qpos[:16], body.qvel[:16], body.qpos[19:23]
+    target = low + (action + 1) / 2 * (high - low)
+    torques = jnp.clip(STIFFNESS * (target - angles) - DAMPING * velocities, -LARGEST_TORQUE, LARGEST_TORQUE)
+    entries = [
+        (2 * angles - high - low) / (high - low),
+        0.2 * velocities,
+        10.0 * torques,
+        body.qpos[16:19],
+        _scalar_last(orientation),
+        body.qvel[16:19],
+        0.2 * rotation_matrix(orientation) @ body.qvel[19:22],
+        jnp.asarray(GOAL_POSITION),
+        _scalar_last(hand.goal),
+        _scalar_last(multiply(orientation, conjugate(hand.goal))),
+        action,
+    ]
+    return jnp.clip(jnp.concatenate(entries), -5.0, 5.0)
+
+
+def _scalar_last(quaternion: jax.Array) -> jax.Array:
+    return jnp.roll(quaternion, -1)

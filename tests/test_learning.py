@@ -35,7 +35,7 @@ def test_cur_beats_offline_demonstrations_of_equal_cost_on_navigation():
     human_time = [int(result.metrics.human_steps.sum()) for result in results]
 
     # The baseline's gradient steps, `gradient_steps` a timestep more than the online arm's start, are make_config's doing.
-    offline = fleetjax.make_config("navigation", "constraint", **shared)
+    offline = fleetjax.make_config("navigation", "constraint", extra_demonstrations=0, **shared)
     assert int(offline.pretraining_steps) == int(online.pretraining_steps) + online.num_steps * online.gradient_steps
     clones = [prepare(offline.replace(extra_demonstrations=t), key).learner for t, key in zip(human_time, keys, strict=True)]
 

@@ -5,7 +5,6 @@ paper's (Section 5.2 and Appendix); environments change some of them, see `fleet
 """
 
 import dataclasses
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -177,22 +176,9 @@ def make_config(environment: "str | envs.Env", algorithm: str = "cur", **overrid
         budget = {"pretraining_steps": fields["pretraining_steps"] + fields["num_steps"] * fields["gradient_steps"]}
         budget["extra_demonstrations"] = envs.CUR_HUMAN_TIME.get(name, 0)
         fields |= {k: v for k, v in budget.items() if k not in overrides}
-    if algorithm == "random" and name in envs.CUR_HUMAN_TIME and "random_threshold" not in overrides:
-        fields["random_threshold"] = _random_threshold(name, defaults)
     config = Config().replace(**fields)
     validate(config, environment if isinstance(environment, envs.Env) else None)
     return config
-
-
-def _random_threshold(name: str, defaults: Mapping[str, Any]) -> float:
-    """Return the threshold at which random robots get as much human time as C.U.R. asked for.
-
-    Each of N robots asks with probability 1 - threshold a timestep, and is then helped for t_T timesteps.
-    """
-    num_robots, num_steps, duration = (
-        defaults.get(field, getattr(Config, field)) for field in ("num_robots", "num_steps", "min_teleop_time")
-    )
-    return 1 - envs.CUR_HUMAN_TIME[name] / (num_robots * num_steps * duration)
 
 
 def validate(config: Config, env: "envs.Env | None" = None) -> None:

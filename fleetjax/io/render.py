@@ -4,6 +4,7 @@ import contextlib
 import importlib.util
 import io
 import os
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -184,4 +185,7 @@ def encode(pictures: Iterator[np.ndarray], path: Path, *, rate: float) -> bytes:
         return data.getvalue()
     import imageio.v3  # pyright: ignore[reportMissingImports]  an extra
 
-    return imageio.v3.imwrite("<bytes>", list(pictures), extension=".mp4", fps=rate, codec="libx264", macro_block_size=2)
+    options: dict[str, Any] = {"fps": rate, "codec": "libx264", "macro_block_size": 2}
+    with warnings.catch_warnings():  # the forked child becomes ffmpeg at once and runs none of JAX's threads
+        warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning)
+        return imageio.v3.imwrite("<bytes>", list(pictures), extension=".mp4", **options)

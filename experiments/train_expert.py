@@ -27,6 +27,7 @@ from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks, train
 from flax import linen, serialization
 
+from fleetjax import tree
 from fleetjax.envs import Env, allegro_hand, anymal, humanoid
 from fleetjax.supervisors import expert
 from fleetjax.types import EnvState
@@ -43,7 +44,7 @@ class Training(NamedTuple):
         measure: name of what is reported beside the return, and `EnvState -> f32[]`, averaged over steps.
         reward: `(before, after) -> f32[]`, what PPO sees in place of the task's reward.
         vary: `(EnvState, key) -> EnvState`, a disturbance before each training step.
-        settings: hyper-parameters of PPO; the rest are brax's defaults.
+        settings: hyper-parameters of PPO besides `SHARED`; the rest are brax's defaults.
         hidden_sizes: units of the hidden layers of policy and value network.
     """
 
@@ -79,6 +80,15 @@ def change_command(state: EnvState, key: jax.Array) -> EnvState:
     return state._replace(physics=walker, obs=anymal.observe(walker, state.obs[36:]))
 
 
+SHARED = {
+    "num_envs": 1024,
+    "unroll_length": 16,
+    "batch_size": 64,
+    "num_minibatches": 32,
+    "num_updates_per_batch": 4,
+    "learning_rate": 3e-4,
+    "max_grad_norm": 1.0,
+}
 TRAININGS = {
     "allegro_hand": Training(
         make_env=lambda success_return: allegro_hand.make_env(),
@@ -86,17 +96,10 @@ TRAININGS = {
         measure=("goals_per_step", lambda state: state.success.astype(jnp.float32)),
         hidden_sizes=(512, 256, 128),
         settings={
-            "num_envs": 1024,
-            "unroll_length": 16,
-            "batch_size": 64,
-            "num_minibatches": 32,
-            "num_updates_per_batch": 4,
-            "learning_rate": 3e-4,
             "clipping_epsilon": 0.2,
             "entropy_cost": 2e-3,
             "discounting": 0.99,
             "reward_scaling": 0.01,
-            "max_grad_norm": 1.0,
             "num_resets_per_eval": 1,
             "episode_length": allegro_hand.HORIZON,
         },
@@ -108,17 +111,10 @@ TRAININGS = {
         reward=smooth_walking,
         vary=change_command,
         settings={
-            "num_envs": 1024,
-            "unroll_length": 16,
-            "batch_size": 64,
-            "num_minibatches": 32,
-            "num_updates_per_batch": 4,
-            "learning_rate": 3e-4,
             "clipping_epsilon": 0.2,
             "entropy_cost": 1e-2,
             "discounting": 0.97,
             "reward_scaling": 4.0,
-            "max_grad_norm": 1.0,
             "num_resets_per_eval": 1,
             "episode_length": 1000,
         },
@@ -128,17 +124,10 @@ TRAININGS = {
         success_floor=humanoid.SUCCESS_FLOOR,
         measure=("mean_forward_speed", humanoid.forward_speed),
         settings={
-            "num_envs": 1024,
-            "unroll_length": 16,
-            "batch_size": 64,
-            "num_minibatches": 32,
-            "num_updates_per_batch": 4,
-            "learning_rate": 3e-4,
             "clipping_epsilon": 0.3,
             "entropy_cost": 1e-3,
             "discounting": 0.97,
             "reward_scaling": 0.1,
-            "max_grad_norm": 1.0,
             "episode_length": humanoid.HORIZON,
         },
     ),
@@ -184,8 +173,7 @@ class Task(BraxEnv):
         reward, done = self.training.reward(before, after), after.violation.astype(jnp.float32)
         info = {**state.info, "key": key_next}
         if self.env.next_goal:
-            renewed = self.env.next_goal(after, key_goal)
-            after = jax.tree.map(lambda new, old: jnp.where(after.success, new, old), renewed, after)
+            after = tree.where(after.success, self.env.next_goal(after, key_goal), after)
         return state.replace(pipeline_state=after, obs=after.obs, reward=reward, done=done, info=info)
 
     @property
@@ -258,7 +246,7 @@ def train_expert(
         )
 
     remaining = num_timesteps - done
-    settings = dict(TRAININGS[name].settings)
+    settings = SHARED | TRAININGS[name].settings
     if learning_rate is not None:
         settings["learning_rate"] = learning_rate
     train.train(

@@ -189,9 +189,9 @@ def _render(arguments: argparse.Namespace) -> None:
 
     path = Path(arguments.source)
     with _refusing():
-        for name in ("num_shown", "num_steps", "every", "width"):
-            if getattr(arguments, name) < 1:
-                raise ValueError(f"{name} = {getattr(arguments, name)} must be at least 1")
+        for name, low in {"num_shown": 1, "num_steps": 1, "every": 1, "width": 1, "skip": 0}.items():
+            if getattr(arguments, name) < low:
+                raise ValueError(f"{name} = {getattr(arguments, name)} must be at least {low}")
         render.check_format(arguments.output)
         run = None if arguments.source in list_envs() else folder.read_run(path)
         policy = arguments.policy or ("robot" if run else "expert")
@@ -204,8 +204,9 @@ def _render(arguments: argparse.Namespace) -> None:
             config = make_config(config.environment, "expert", **shown, backend=config.backend)
         learner = folder.read_policy(run) if run and policy == "robot" else None
     folder.check_free(arguments.output, overwrite=arguments.overwrite)
-    key = jax.random.key(arguments.seed if arguments.seed is not None else run.seed if run else 0)
-    say(f"{text.headline(config, 0).rsplit(',', 1)[0]}, policy {policy}: running ...")
+    seed = arguments.seed if arguments.seed is not None else run.seed if run else 0
+    key = jax.random.key(seed)
+    say(f"{text.headline(config, seed)}, policy {policy}: running ...")
     config, state = render.start(config, key, learner, skip=arguments.skip)
     film = render.shoot(config.replace(num_steps=arguments.num_steps), key, state, num_shown=arguments.num_shown)
     say("drawing ...")

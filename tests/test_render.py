@@ -94,6 +94,7 @@ def test_render_writes_a_gif(tmp_path, capsys):
     [
         (("humanoid", "--output", "x.avi"), "x.avi must end in one of .gif, .mp4"),
         (("humanoid", "--num-shown", 0), "num_shown = 0 must be at least 1"),
+        (("humanoid", "--skip", -1), "skip = -1 must be at least 0"),
         (("humanoid", "--policy", "robot"), "--policy robot needs a run folder"),
         (("navigation",), "environment = 'navigation' has no bodies to draw"),
         (("nowhere",), "nowhere is not a run folder"),

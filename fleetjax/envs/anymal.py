@@ -50,7 +50,7 @@ def make_env(*, backend: str = "auto", success_return: float | None = None) -> b
     if success_return is None:
         from fleetjax.supervisors import expert
 
-        success_return = max(SUCCESS_FLOOR, 0.95 * expert.mean_return("anymal"))
+        success_return = expert.success_return("anymal", SUCCESS_FLOOR)
     physics = make_physics("anymal.xml", substeps=SUBSTEPS, backend=backend)
     spec = base.EnvSpec("anymal", 48, physics.model.nu, HORIZON, physics.control_step, supervisor="anymal")
 

@@ -32,7 +32,7 @@ def make_env(*, backend: str = "auto", success_return: float | None = None) -> b
     if success_return is None:
         from fleetjax.supervisors import expert
 
-        success_return = max(SUCCESS_FLOOR, 0.95 * expert.mean_return("humanoid"))
+        success_return = expert.success_return("humanoid", SUCCESS_FLOOR)
     physics = make_physics("humanoid.xml", substeps=SUBSTEPS, backend=backend)
     spec = base.EnvSpec("humanoid", 108, physics.model.nu, HORIZON, physics.control_step, supervisor="humanoid")
     joints = _Joints(physics.model)

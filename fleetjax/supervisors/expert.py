@@ -34,6 +34,11 @@ def mean_return(name: str) -> float:
     return float(record(name)["mean_return_full_length"] or 0)
 
 
+def success_return(name: str, floor: float) -> float:
+    """Return the return above which an episode of full length succeeds: 95 % of the expert's mean, and no less than `floor`."""
+    return max(floor, 0.95 * mean_return(name))
+
+
 @functools.cache
 def load_weights(name: str) -> dict[str, np.ndarray]:
     """Return the arrays of a shipped expert.

@@ -14,7 +14,7 @@ import csv
 import functools
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,10 +29,27 @@ from flax import linen, serialization
 
 from fleetjax import tree
 from fleetjax.envs import Env, allegro_hand, anymal, humanoid
+from fleetjax.envs.rotation import angle_between
 from fleetjax.supervisors import expert
 from fleetjax.types import EnvState
 
 PACKAGE_WEIGHTS = Path(expert.__file__).parent / "weights"
+
+
+class Stage(NamedTuple):
+    """A part of a training.
+
+    Attributes:
+        reward: `(before, after) -> f32[]`, what PPO sees in place of the task's reward.
+        settings: hyper-parameters of PPO besides `SHARED`; the rest are brax's defaults.
+        begins: after how many environment steps.
+        noise: the largest standard deviation that actions of a `CLIPPED_NORMAL` policy have at the beginning.
+    """
+
+    settings: dict[str, Any]
+    reward: Callable[[EnvState, EnvState], jax.Array] = lambda before, after: after.reward
+    begins: int = 0
+    noise: float = 1.0
 
 
 class Training(NamedTuple):
@@ -42,31 +59,43 @@ class Training(NamedTuple):
         make_env: builds the environment; `success_return` is a keyword.
         success_floor: the return below which no episode succeeds.
         measure: name of what is reported beside the return, and `EnvState -> f32[]`, averaged over steps.
-        reward: `(before, after) -> f32[]`, what PPO sees in place of the task's reward.
+        stages: one after the other.
         vary: `(EnvState, key) -> EnvState`, a disturbance before each training step.
-        settings: hyper-parameters of PPO besides `SHARED`; the rest are brax's defaults.
         hidden_sizes: units of the hidden layers of policy and value network.
+        network: what else brax's networks are built with.
+        episode_length: of training, in control steps.
+        step_size: where given, the policy's outputs times this are added to the last action, which is the observation's end.
     """
 
     make_env: Callable[..., Env]
     success_floor: float
     measure: tuple[str, Callable[[EnvState], jax.Array]]
-    settings: dict[str, Any]
-    reward: Callable[[EnvState, EnvState], jax.Array] = lambda before, after: after.reward
+    episode_length: int
+    stages: tuple[Stage, ...]
     vary: Callable[[EnvState, jax.Array], EnvState] = lambda state, key: state
     hidden_sizes: tuple[int, ...] = (256, 128)
+    network: Mapping[str, Any] = {}
+    step_size: float | None = None
 
 
-def smooth_walking(before: EnvState, after: EnvState) -> jax.Array:
-    """Return ANYmal's reward and something for any progress towards the command, less a little for trembling.
+def progress(before: EnvState, after: EnvState) -> jax.Array:
+    """Return ANYmal's reward, and more for each part of the commanded velocity that it reaches.
 
-    The task's own reward is flat where the robot stands and should run.
+    The task's own reward is flat where the robot stands and should run. Standing still earns little here, and nothing is
+    negative, for a robot that only loses learns to fall.
     """
-    _, angular = anymal.base_velocity(after.physics.body)
-    turning_error = jnp.abs(angular[2] - after.physics.command[2])
-    progress = jnp.exp(-anymal.tracking_error(after)) + 0.5 * jnp.exp(-turning_error)
-    trembling = jnp.sum((after.obs[36:] - before.obs[36:]) ** 2)
-    return after.reward + 0.02 * progress - 5e-4 * trembling
+    del before
+    linear, angular = anymal.base_velocity(after.physics.body)
+    command = after.physics.command
+    missed = jnp.linalg.norm(linear[:2] - command[:2]) / jnp.maximum(jnp.linalg.norm(command[:2]), 0.3)
+    turning_missed = jnp.abs(angular[2] - command[2]) / jnp.maximum(jnp.abs(command[2]), 0.3)
+    reached = jnp.maximum(1.25 - missed, 0.0) + 0.5 * jnp.maximum(1.25 - turning_missed, 0.0)
+    return after.reward + 0.03 * reached
+
+
+def calm_walking(before: EnvState, after: EnvState) -> jax.Array:
+    """Return ANYmal's reward, less a little for trembling."""
+    return after.reward - 5e-4 * jnp.sum((after.obs[36:] - before.obs[36:]) ** 2)
 
 
 def change_command(state: EnvState, key: jax.Array) -> EnvState:
@@ -80,6 +109,13 @@ def change_command(state: EnvState, key: jax.Array) -> EnvState:
     return state._replace(physics=walker, obs=anymal.observe(walker, state.obs[36:]))
 
 
+def turning(before: EnvState, after: EnvState) -> jax.Array:
+    """Return the Allegro hand's reward, and more for each radian that the cube comes closer to its goal; a drop costs 20."""
+    hands = (before.physics, after.physics)
+    angle_before, angle_after = (angle_between(hand.body.qpos[19:23], hand.goal) for hand in hands)
+    return after.reward + 10.0 * (angle_before - angle_after) - 20.0 * after.violation
+
+
 SHARED = {
     "num_envs": 1024,
     "unroll_length": 16,
@@ -89,47 +125,63 @@ SHARED = {
     "learning_rate": 3e-4,
     "max_grad_norm": 1.0,
 }
+LARGE_BATCHES = {
+    "clipping_epsilon": 0.2,
+    "entropy_cost": 2e-3,
+    "num_envs": 2048,
+    "unroll_length": 24,
+    "batch_size": 512,
+    "num_minibatches": 4,
+    "num_updates_per_batch": 5,
+    "learning_rate": 5e-4,
+    "learning_rate_schedule": "ADAPTIVE_KL",
+    "learning_rate_schedule_max_lr": 3e-3,
+    "desired_kl": 0.012,
+    "vf_loss_coefficient": 1.0,
+}
+# Actions from a normal distribution that the environment clips, of a width that does not depend on the state: a wide one
+# keeps the robot moving until it has found a gait. With brax's default, a normal distribution under tanh, ANYmal learns to
+# stand, and goes on standing.
+CLIPPED_NORMAL = {
+    "distribution_type": "normal",
+    "noise_std_type": "log",
+    "init_noise_std": 1.0,
+    "mean_kernel_init_fn": lambda: jax.nn.initializers.variance_scaling(0.01, "fan_in", "uniform"),
+}
 TRAININGS = {
     "allegro_hand": Training(
         make_env=lambda success_return: allegro_hand.make_env(),
         success_floor=float("inf"),  # goals count, returns do not
         measure=("goals_per_step", lambda state: state.success.astype(jnp.float32)),
-        hidden_sizes=(512, 256, 128),
-        settings={
-            "clipping_epsilon": 0.2,
-            "entropy_cost": 2e-3,
-            "discounting": 0.99,
-            "reward_scaling": 0.01,
-            "num_resets_per_eval": 1,
-            "episode_length": allegro_hand.HORIZON,
-        },
+        hidden_sizes=(256, 256, 128),
+        network=CLIPPED_NORMAL,
+        step_size=0.3,
+        episode_length=allegro_hand.HORIZON,
+        stages=(Stage(LARGE_BATCHES | {"discounting": 0.99, "reward_scaling": 0.02}, turning),),
     ),
     "anymal": Training(
         make_env=anymal.make_env,
         success_floor=anymal.SUCCESS_FLOOR,
         measure=("mean_tracking_error", anymal.tracking_error),
-        reward=smooth_walking,
         vary=change_command,
-        settings={
-            "clipping_epsilon": 0.2,
-            "entropy_cost": 1e-2,
-            "discounting": 0.97,
-            "reward_scaling": 4.0,
-            "num_resets_per_eval": 1,
-            "episode_length": 1000,
-        },
+        network=CLIPPED_NORMAL,
+        episode_length=1000,
+        stages=(
+            Stage(LARGE_BATCHES | {"discounting": 0.98, "reward_scaling": 3.0}, progress),
+            Stage(
+                LARGE_BATCHES | {"discounting": 0.99, "reward_scaling": 5.0, "entropy_cost": 0.0},
+                calm_walking,
+                begins=9_000_000,
+                noise=0.3,
+            ),
+        ),
     ),
     "humanoid": Training(
         make_env=humanoid.make_env,
         success_floor=humanoid.SUCCESS_FLOOR,
         measure=("mean_forward_speed", humanoid.forward_speed),
-        settings={
-            "clipping_epsilon": 0.3,
-            "entropy_cost": 1e-3,
-            "discounting": 0.97,
-            "reward_scaling": 0.1,
-            "episode_length": humanoid.HORIZON,
-        },
+        episode_length=humanoid.HORIZON,
+        stages=(Stage({"clipping_epsilon": 0.3, "entropy_cost": 1e-3, "discounting": 0.97, "reward_scaling": 0.1}),),
     ),
 }
 
@@ -141,6 +193,7 @@ def network_factory(training: Training) -> Callable[..., networks.PPONetworks]:
         policy_hidden_layer_sizes=training.hidden_sizes,
         value_hidden_layer_sizes=training.hidden_sizes,
         activation=linen.elu,
+        **training.network,
     )
 
 
@@ -156,9 +209,9 @@ if not hasattr(jax, "device_put_replicated"):  # brax 0.14.2 calls it; jax 0.10 
 class Task(BraxEnv):
     """A fleetjax environment as brax sees it; brax's own wrappers reset it and cut its episodes."""
 
-    def __init__(self, training: Training):
+    def __init__(self, training: Training, stage: Stage):
         self.env = training.make_env(success_return=float("inf"))
-        self.training = training
+        self.training, self.stage = training, stage
 
     def reset(self, rng: jax.Array) -> State:
         """Start an episode."""
@@ -169,8 +222,10 @@ class Task(BraxEnv):
         """Take one control step; a violation ends the episode."""
         key_next, key_vary, key_step, key_goal = jax.random.split(state.info["key"], 4)
         before = self.training.vary(state.pipeline_state, key_vary)
+        if self.training.step_size:
+            action = expert.add_to_last(before.obs, self.training.step_size * jnp.clip(action, -1.0, 1.0))
         after = self.env.step(before, action, jnp.bool_(True), key_step)
-        reward, done = self.training.reward(before, after), after.violation.astype(jnp.float32)
+        reward, done = self.stage.reward(before, after), after.violation.astype(jnp.float32)
         info = {**state.info, "key": key_next}
         if self.env.next_goal:
             after = tree.where(after.success, self.env.next_goal(after, key_goal), after)
@@ -210,12 +265,45 @@ def train_expert(
 ) -> None:
     """Train until `num_timesteps` in all, from the last checkpoint if there is one."""
     folder.mkdir(parents=True, exist_ok=True)
-    task = Task(TRAININGS[name])
-    done, restore = 0, None
-    if checkpoints(folder):
+    stages = TRAININGS[name].stages
+    ends = [*(stage.begins for stage in stages[1:]), num_timesteps]
+    for stage, end in zip(stages, ends, strict=True):
+        settings = stage.settings | ({} if learning_rate is None else {"learning_rate": learning_rate})
+        if steps_done(folder) < min(end, num_timesteps):
+            train_stage(
+                Task(TRAININGS[name], stage._replace(settings=settings)),
+                folder,
+                num_timesteps=min(end, num_timesteps),
+                evaluate_every=evaluate_every,
+                seed=seed,
+            )
+
+
+def steps_of(checkpoint: Path) -> int:
+    """Return the environment steps that went into a checkpoint."""
+    return int(checkpoint.stem.split("_")[1])
+
+
+def steps_done(folder: Path) -> int:
+    """Return the environment steps that went into the last checkpoint; 0 if there is none."""
+    return max(map(steps_of, checkpoints(folder)), default=0)
+
+
+def limit_noise(policy: Any, noise: float) -> Any:
+    """Return the parameters of a policy whose actions have at most this standard deviation; of another kind, as it is."""
+    modules = dict(policy["params"])
+    if "std_logparam" in modules:
+        modules["std_logparam"] = jax.tree.map(lambda x: jnp.minimum(x, jnp.log(noise)), modules["std_logparam"])
+    return {"params": modules}
+
+
+def train_stage(task: Task, folder: Path, *, num_timesteps: int, evaluate_every: int, seed: int) -> None:
+    """Train with the settings of one stage, from the last checkpoint if there is one."""
+    done, restore = steps_done(folder), None
+    if done:
         last = checkpoints(folder)[-1]
-        done = int(last.stem.split("_")[1])
-        restore = serialization.from_bytes(template(task), last.read_bytes())
+        statistics, policy, value = serialization.from_bytes(template(task), last.read_bytes())
+        restore = (statistics, limit_noise(policy, task.stage.noise), value)
         print(f"going on from {last} at {done:,} steps")
     start = time.time()
 
@@ -239,19 +327,14 @@ def train_expert(
             if new:
                 writer.writeheader()
             writer.writerow(row)
-        print(
-            row,
-            {k: float(v) for k, v in metrics.items() if any(word in k for word in ("kl", "learning_rate", "sps"))},
-            flush=True,
-        )
+        shown = ("kl", "learning_rate", "mean_std", "sps")
+        print(row, {k: float(v) for k, v in metrics.items() if any(word in k for word in shown)}, flush=True)
 
     remaining = num_timesteps - done
-    settings = SHARED | TRAININGS[name].settings
-    if learning_rate is not None:
-        settings["learning_rate"] = learning_rate
     train.train(
         environment=task,
         num_timesteps=remaining,
+        episode_length=task.training.episode_length,
         normalize_observations=True,
         network_factory=network_factory(task.training),
         num_evals=max(2, 1 + remaining // evaluate_every),
@@ -261,20 +344,24 @@ def train_expert(
         progress_fn=log,
         policy_params_fn=save,
         restore_params=restore,
-        **settings,
+        **SHARED | task.stage.settings,
     )
 
 
-def as_weights(params) -> dict[str, np.ndarray]:
+def as_weights(params, step_size: float | None = None) -> dict[str, np.ndarray]:
     """Turn brax parameters into the arrays that the package ships (see `fleetjax.supervisors.expert`)."""
     statistics, policy, _ = params
-    weights = {"obs_mean": np.asarray(statistics.mean), "obs_std": np.asarray(statistics.std)}
-    for i, (_, layer) in enumerate(sorted(policy["params"].items())):
-        weights[f"kernel_{i}"], weights[f"bias_{i}"] = np.asarray(layer["kernel"]), np.asarray(layer["bias"])
-    final = max(int(k.split("_")[1]) for k in weights if k.startswith("kernel"))
-    half = weights[f"kernel_{final}"].shape[1] // 2  # mean and scale; the expert acts with the mean
-    weights[f"kernel_{final}"], weights[f"bias_{final}"] = weights[f"kernel_{final}"][:, :half], weights[f"bias_{final}"][:half]
-    return weights
+    modules = policy["params"]
+    clipped = "MLP_0" in modules
+    layers = [layer for _, layer in sorted((modules["MLP_0"] if clipped else modules).items())]
+    layers = [*layers, modules["Dense_0"]] if clipped else layers
+    weights: dict[str, Any] = {"obs_mean": statistics.mean, "obs_std": statistics.std}
+    for i, layer in enumerate(layers):
+        actions = layer["bias"].size // 2 if layer is layers[-1] and not clipped else None  # the other half are their scales
+        weights[f"kernel_{i}"], weights[f"bias_{i}"] = layer["kernel"][:, :actions], layer["bias"][:actions]
+    weights |= {"bound": np.float32(1.0)} if clipped else {}
+    weights |= {"step_size": np.float32(step_size)} if step_size else {}
+    return {name: np.asarray(value) for name, value in weights.items()}
 
 
 def ship(name: str, folder: Path, *, candidates: int, num_episodes: int) -> None:
@@ -286,18 +373,19 @@ def ship(name: str, folder: Path, *, candidates: int, num_episodes: int) -> None
     with (folder / "curve.csv").open() as file:
         curve = {int(row["steps"]): float(row["episode_return"]) for row in csv.DictReader(file)}
     training = TRAININGS[name]
-    task, (label, measure) = Task(training), training.measure
-    ranked = sorted(checkpoints(folder), key=lambda path: -curve.get(int(path.stem.split("_")[1]), -np.inf))
+    task, (label, measure) = Task(training, training.stages[-1]), training.measure
+    finished = [path for path in checkpoints(folder) if steps_of(path) > training.stages[-1].begins]
+    ranked = sorted(finished, key=lambda path: -curve.get(steps_of(path), -np.inf))
     best = None
     for path in ranked[:candidates]:
-        weights = as_weights(serialization.from_bytes(template(task), path.read_bytes()))
+        weights = as_weights(serialization.from_bytes(template(task), path.read_bytes()), training.step_size)
         score = jax.jit(lambda w, key: expert.score(task.env, w, measure, num_episodes=num_episodes, key=key))
         returns, lengths, measured = map(np.asarray, score(weights, jax.random.key(1)))
         full = lengths == task.env.spec.horizon
         mean = float(returns[full].mean()) if full.any() else float("nan")
         record = {
             "environment": name,
-            "steps": int(path.stem.split("_")[1]),
+            "steps": steps_of(path),
             "num_episodes": num_episodes,
             "mean_return": round(float(returns.mean()), 1),
             "mean_return_full_length": round(mean, 1),
@@ -309,7 +397,7 @@ def ship(name: str, folder: Path, *, candidates: int, num_episodes: int) -> None
         criterion = label if task.env.next_goal else "share_successful"
         if best is None or record[criterion] > best[0][criterion]:
             best = (record, weights)
-    assert best is not None, f"no checkpoint in {folder}"
+    assert best is not None, f"no checkpoint of the last stage in {folder}"
     PACKAGE_WEIGHTS.mkdir(exist_ok=True)
     np.savez_compressed(PACKAGE_WEIGHTS / f"{name}.npz", **best[1])  # pyright: ignore[reportArgumentType]
     (PACKAGE_WEIGHTS / f"{name}.json").write_text(json.dumps(best[0], indent=2) + "\n")

@@ -1,42 +1,95 @@
-"""Record humanoid states for the physics tests: `python tests/record_states.py` writes tests/data/humanoid_states.npz.
+"""Record states of the robots for the physics tests: `python tests/record_states.py` writes tests/data/ENVIRONMENT_states.npz.
 
-Humanoids walk under the shipped expert with more or less noise on its actions. Out of the states before any fall, half of
-those kept have three contacts or more.
+Robots act with more or less noise. Out of the states before any violation, half of those kept have three contacts or more.
 """
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from fleetjax import envs, supervisors
-from fleetjax.physics.base import make_physics
+from fleetjax import supervisors
+from fleetjax.envs import Env, allegro_hand, anymal, humanoid
+from fleetjax.physics.base import Physics, PhysicsState, make_physics
+from fleetjax.types import EnvState
 
-FILE = Path(__file__).parent / "data" / "humanoid_states.npz"
+DATA = Path(__file__).parent / "data"
 NUM_ROBOTS, NUM_STEPS, NUM_KEPT = 64, 150, 128
 
 
-def walk(key):
-    """Return states and actions [T * N] of robots that have not fallen."""
-    env = envs.make("humanoid", "native")
-    supervisor = supervisors.make("humanoid", env)
-    noise = jnp.linspace(0.0, 1.0, NUM_ROBOTS)[:, None]
+class Robot(NamedTuple):
+    """What the physics tests must know of an environment.
+
+    Attributes:
+        module: where it is.
+        control: `(action, model) -> controls`, what the environment makes of actions.
+        body: `EnvState.physics -> PhysicsState`.
+        noise: largest standard deviation of the noise on actions.
+        under_expert: noise on the expert's actions; else on the last action, so that servos wander.
+    """
+
+    module: Any
+    control: Callable[[jax.Array, mujoco.MjModel], jax.Array]
+    body: Callable[[Any], PhysicsState]
+    noise: float
+    under_expert: bool = True
+
+
+ROBOTS = {
+    "humanoid": Robot(humanoid, lambda action, model: action, lambda physics: physics, 1.0),
+    "anymal": Robot(anymal, lambda action, model: anymal.targets(action), lambda physics: physics.body, 1.0),
+    "allegro_hand": Robot(
+        allegro_hand,
+        lambda action, model: allegro_hand.targets(action, *jnp.float32(model.jnt_range[:16].T)),
+        lambda physics: physics.body,
+        0.3,
+        under_expert=False,
+    ),
+}
+
+
+def make_policy(name: str, env: Env, num_robots: int):
+    """Return `(states, key) -> actions`; the first robot's have no noise, the last robot's most."""
+    supervisor = supervisors.make(name, env) if ROBOTS[name].under_expert else None
+    scale = jnp.linspace(0.0, ROBOTS[name].noise, num_robots)[:, None]
+
+    def act(state: EnvState, key: jax.Array) -> jax.Array:
+        key_act, key_noise = jax.random.split(key)
+        if supervisor:
+            action = jax.vmap(supervisor.act)(state, jax.random.split(key_act, num_robots))
+        else:
+            action = state.obs[:, -env.spec.action_size :]
+        return jnp.clip(action + scale * jax.random.normal(key_noise, action.shape), -1.0, 1.0)
+
+    return act
+
+
+def wander(name: str, key: jax.Array):
+    """Return states and controls [K] of robots that are not in violation."""
+    env = ROBOTS[name].module.make_env(backend="native")
+    act = make_policy(name, env, NUM_ROBOTS)
     key_reset, key_steps = jax.random.split(key)
     start = jax.vmap(env.reset)(jax.random.split(key_reset, NUM_ROBOTS), jnp.arange(NUM_ROBOTS))
 
     def step(state, key):
-        key_act, key_noise, key_env = jax.random.split(key, 3)
-        action = jax.vmap(supervisor.act)(state, jax.random.split(key_act, NUM_ROBOTS))
-        action = jnp.clip(action + noise * jax.random.normal(key_noise, action.shape), -1.0, 1.0)
+        key_act, key_env = jax.random.split(key)
+        action = act(state, key_act)
         after = jax.vmap(env.step)(state, action, ~state.violation, jax.random.split(key_env, NUM_ROBOTS))
-        after = after._replace(violation=after.violation | state.violation)
-        return after, (state, action)
+        return after._replace(violation=after.violation | state.violation), (state, action)
 
     states, actions = jax.jit(lambda s, k: jax.lax.scan(step, s, k)[1])(start, jax.random.split(key_steps, NUM_STEPS))
-    upright = ~np.asarray(states.violation)
-    return jax.tree.map(lambda x: np.asarray(x)[upright], (states.physics, actions))
+    moving = ~np.asarray(states.violation)
+    bodies = jax.tree.map(lambda x: np.asarray(x)[moving], ROBOTS[name].body(states.physics))
+    return bodies, np.asarray(ROBOTS[name].control(actions[moving], physics_of(name).model))
+
+
+def physics_of(name: str, backend: str = "native") -> Physics:
+    """Return the physics of an environment."""
+    return make_physics(f"{name}.xml", substeps=ROBOTS[name].module.SUBSTEPS, backend=backend)
 
 
 def count_contacts(model, qpos):
@@ -51,15 +104,17 @@ def count_contacts(model, qpos):
     return np.array([count(q) for q in qpos])
 
 
-def main():
-    physics, actions = walk(jax.random.key(0))
-    contacts = count_contacts(make_physics("humanoid.xml", substeps=3, backend="native").model, physics.qpos)
+def record(name: str):
+    """Write the file of an environment."""
+    bodies, control = wander(name, jax.random.key(0))
+    contacts = count_contacts(physics_of(name).model, bodies.qpos)
     rng = np.random.default_rng(0)
     many, few = (rng.permutation(np.flatnonzero(x))[: NUM_KEPT // 2] for x in (contacts >= 3, contacts < 3))
     kept = np.concatenate([many, few])
-    fields = {name: getattr(physics, name)[kept] for name in physics._fields}
-    np.savez_compressed(FILE, action=actions[kept], **fields)
+    fields = {field: getattr(bodies, field)[kept] for field in bodies._fields}
+    np.savez_compressed(DATA / f"{name}_states.npz", control=control[kept], **fields)
 
 
 if __name__ == "__main__":
-    main()
+    for environment in ROBOTS:
+        record(environment)

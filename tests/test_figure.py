@@ -42,11 +42,17 @@ def test_seeds_become_one_line_and_settings_another(config):
     np.testing.assert_array_equal(groups[0].values[0, 0], np.cumsum(make_metrics(3).successes)[:30])
 
 
-def test_labels_tell_environments_and_settings_apart(config):
+def test_labels_tell_settings_apart_and_rows_tell_environments_apart(config):
     humanoid = fleetjax.make_config("humanoid")
     runs = [(c, 0, make_metrics()) for c in (config, humanoid, humanoid.replace(risk_threshold=0.25))]
-    labels = [curves.label for curves in figure.group(runs)]
-    assert labels == ["C.U.R., navigation", "C.U.R., humanoid, risk_threshold 0.5", "C.U.R., humanoid, risk_threshold 0.25"]
+    groups = figure.group(runs)
+    names = ["C.U.R.", "C.U.R., risk_threshold 0.5", "C.U.R., risk_threshold 0.25"]
+    assert [curves.label for curves in groups] == names
+    drawn = figure.draw(groups)
+    rows = np.array(drawn.axes).reshape(2, 4)
+    assert [row[0].get_ylabel() for row in rows] == ["navigation", "humanoid"]
+    assert [[line.get_label() for line in ax.lines] for ax in rows[:, 2]] == [names[:1], names[1:]]
+    assert [entry.get_text() for entry in drawn.legends[0].get_texts()] == names
 
 
 def test_the_band_is_one_standard_deviation_about_the_mean(config):

@@ -10,86 +10,76 @@ import mujoco
 import numpy as np
 import pytest
 from compiling import compiled
-from record_states import FILE, count_contacts
+from record_states import DATA, ROBOTS, count_contacts, make_policy, physics_of
 
-from fleetjax import envs, supervisors
 from fleetjax.physics import mjx, native
 from fleetjax.physics.base import PhysicsState, make_physics, resolve_backend
 
-SUBSTEPS = 3
 NUM_ROBOTS = 32  # of every batch, so that MJX compiles once
 BACKENDS = ("native", "mjx")
 
-
-class Robots:
-    """A batch of humanoids on one backend."""
-
-    def __init__(self, backend: str):
-        self.env = envs.make("humanoid", backend)
-        self._step = compiled(jax.vmap(self.env.step, in_axes=(0, 0, 0, None)))
-
-    def step(self, state: envs.base.EnvState, action, active=True) -> envs.base.EnvState:
-        return self._step(state, action, jnp.broadcast_to(active, NUM_ROBOTS), jax.random.key(0))
-
-    def move(self, physics: PhysicsState, action, active=True) -> PhysicsState:
-        state = jax.vmap(envs.begin)(physics, jnp.zeros((NUM_ROBOTS, self.env.spec.observation_size)))
-        return jax.tree.map(np.asarray, self.step(state, action, active).physics)
+each_robot = pytest.mark.parametrize("name", ROBOTS)
+each_backend = pytest.mark.parametrize("backend", BACKENDS)
 
 
 @functools.cache
-def robots(backend: str) -> Robots:
-    return Robots(backend)
+def mover(name: str, backend: str):
+    """Return `(states, controls, active) -> states` of a batch of robots."""
+    step = compiled(jax.vmap(physics_of(name, backend).step))
+
+    def move(states: PhysicsState, control, active=True) -> PhysicsState:
+        return jax.tree.map(np.asarray, step(states, control, jnp.broadcast_to(active, NUM_ROBOTS)))
+
+    return move
 
 
-@pytest.fixture(scope="module")
-def recorded() -> tuple[PhysicsState, np.ndarray]:
-    """128 states before a fall, the first half of them with three contacts or more, and an action for each."""
-    with np.load(FILE) as arrays:
+@functools.cache
+def recorded(name: str) -> tuple[PhysicsState, np.ndarray]:
+    """128 states before a violation, the first half of them with three contacts or more, and controls for each."""
+    with np.load(DATA / f"{name}_states.npz") as arrays:
         fields = dict(arrays)
-    action = fields.pop("action")
-    return PhysicsState(**fields), action
-
-
-@pytest.fixture(scope="module")
-def model() -> mujoco.MjModel:
-    return make_physics("humanoid.xml", substeps=SUBSTEPS, backend="native").model
+    control = fields.pop("control")
+    return PhysicsState(**fields), control
 
 
 def rows(tree, index):
     return jax.tree.map(lambda x: x[index], tree)
 
 
-def mixed(recorded):
-    """Recorded states, half of each kind, and their actions, enough for a batch."""
-    return rows(recorded, slice(64 - NUM_ROBOTS // 2, 64 + NUM_ROBOTS // 2))
+def mixed(name: str):
+    """Recorded states, half of each kind, and their controls, enough for a batch."""
+    return rows(recorded(name), slice(64 - NUM_ROBOTS // 2, 64 + NUM_ROBOTS // 2))
 
 
 def assert_same(tree, other):
     jax.tree.map(np.testing.assert_array_equal, tree, other)
 
 
-def plain_mujoco(model, state, action):
+def plain_mujoco(name, state, control):
     """Step one robot by MuJoCo alone."""
+    model = physics_of(name).model
     data = mujoco.MjData(model)
     data.time, data.qpos[:], data.qvel[:] = state.time, state.qpos, state.qvel
-    data.qacc_warmstart[:], data.ctrl[:] = state.warmstart, action
-    for _ in range(SUBSTEPS):
+    data.qacc_warmstart[:], data.ctrl[:] = state.warmstart, control
+    for _ in range(ROBOTS[name].module.SUBSTEPS):
         mujoco.mj_step(model, data)
     return data
 
 
-def test_half_of_the_recorded_states_have_three_contacts(recorded, model):
-    contacts = count_contacts(model, recorded[0].qpos)
+@each_robot
+def test_half_of_the_recorded_states_have_three_contacts(name):
+    contacts = count_contacts(physics_of(name).model, recorded(name)[0].qpos)
     assert contacts.size >= 64
     assert np.sum(contacts >= 3) >= contacts.size / 2
-    assert np.sum(contacts == 0) > 0
+    assert contacts.min() < 3
 
 
-def test_native_is_mujoco(recorded, model):
-    states, actions = mixed(recorded)
-    after = robots("native").move(states, actions)
+@each_robot
+def test_native_is_mujoco(name):
+    states, controls = mixed(name)
+    after = mover(name, "native")(states, controls)
     for i in range(NUM_ROBOTS):
-        data = plain_mujoco(model, rows(states, i), actions[i])
+        data = plain_mujoco(name, rows(states, i), controls[i])
         got = rows(after, i)
         np.testing.assert_array_equal(got.qpos, data.qpos.astype(np.float32))
         np.testing.assert_array_equal(got.qvel, data.qvel.astype(np.float32))
@@ -99,90 +89,92 @@ def test_native_is_mujoco(recorded, model):
     assert not after.diverged.any()
 
 
-def test_mjx_agrees_with_native(recorded):
+# Median and 95th percentile that the largest error of a robot must stay below: three and ten times what was measured.
+BOUNDS = {  # m and rad; m/s and rad/s; N and N m; m/s^2 and rad/s^2
+    "humanoid": {"qpos": (3e-6, 2e-4), "qvel": (2e-4, 2e-2), "sensors": (2e-2, 15.0), "warmstart": (3e-2, 5.0)},
+}
+
+
+@each_robot
+def test_mjx_agrees_with_native(name):
     """One control step; the largest error of a robot, over robots: median and 95th percentile.
 
-    The bounds are three times what was measured or, for the tail, ten: a few states lie where a contact or a joint limit opens
-    within rounding, or where the two solvers, stopped after two iterations, stand at different points.
+    The tail is wide: a few states lie where a contact or a joint limit opens within rounding, or where the two engines place
+    the contacts of a box differently, or where two solvers, stopped after few iterations, stand at different points.
     """
-    errors = {name: [] for name in ("qpos", "qvel", "sensors", "warmstart")}
-    for batch in np.split(np.arange(len(recorded[1])), len(recorded[1]) // NUM_ROBOTS):
-        states, actions = rows(recorded, batch)
-        one, other = (robots(backend).move(states, actions) for backend in BACKENDS)
+    states, controls = recorded(name)
+    errors = {field: [] for field in BOUNDS[name]}
+    for batch in np.split(np.arange(len(controls)), len(controls) // NUM_ROBOTS):
+        one, other = (mover(name, backend)(rows(states, batch), controls[batch]) for backend in BACKENDS)
         np.testing.assert_allclose(one.time, other.time, rtol=1e-6)
-        for name, found in errors.items():
-            found.append(np.abs(getattr(one, name) - getattr(other, name)).max(axis=1))
-    bounds = {  # m and rad; m/s and rad/s; N and N m
-        "qpos": (3e-6, 2e-4),
-        "qvel": (2e-4, 2e-2),
-        "sensors": (2e-2, 15.0),
-        "warmstart": (3e-2, 5.0),
-    }
-    for name, (median, tail) in bounds.items():
-        error = np.concatenate(errors[name])
-        print(
-            f"{name}: median {np.median(error):.1e}, 95th percentile {np.quantile(error, 0.95):.1e}, largest {error.max():.1e}"
-        )
-        assert np.median(error) < median, name
-        assert np.quantile(error, 0.95) < tail, name
+        for field, found in errors.items():
+            found.append(np.abs(getattr(one, field) - getattr(other, field)).max(axis=1))
+    for field, (median, tail) in BOUNDS[name].items():
+        error = np.concatenate(errors[field])
+        typical, rare = np.quantile(error, [0.5, 0.95])
+        print(f"{name} {field}: median {typical:.1e}, 95th percentile {rare:.1e}, largest {error.max():.1e}")
+        assert typical < median, field
+        assert rare < tail, field
 
 
-def walk(backend: str, num_steps: int):
-    """Return for each robot the number of steps before it falls, under the expert and noise from none to much."""
-    env = robots(backend).env
-    supervisor = supervisors.make("humanoid", env)
+def act(name: str, backend: str, num_steps: int):
+    """Return for each robot the number of steps before its violation, with noise from none to much."""
+    env = ROBOTS[name].module.make_env(backend=backend)
+    policy = jax.jit(make_policy(name, env, NUM_ROBOTS))
+    step = compiled(jax.vmap(env.step, in_axes=(0, 0, 0, None)))
     key_reset, key_noise = jax.random.split(jax.random.key(1))
     state = jax.vmap(env.reset)(jax.random.split(key_reset, NUM_ROBOTS), jnp.arange(NUM_ROBOTS))
-    scale = np.linspace(0.0, 1.0, NUM_ROBOTS)[:, None]
-    noise = scale * np.asarray(jax.random.normal(key_noise, (num_steps, NUM_ROBOTS, env.spec.action_size)))
-    act = jax.jit(lambda state: jax.vmap(supervisor.act, in_axes=(0, None))(state, key_noise))
-    upright, steps = np.ones(NUM_ROBOTS, bool), np.zeros(NUM_ROBOTS)
-    for t in range(num_steps):
-        state = robots(backend).step(state, np.clip(act(state) + noise[t], -1, 1), upright)
-        upright &= ~np.asarray(state.violation)
-        steps += upright
+    active, steps = np.ones(NUM_ROBOTS, bool), np.zeros(NUM_ROBOTS)
+    for key in jax.random.split(key_noise, num_steps):
+        state = step(state, policy(state, key), active, key)
+        active &= ~np.asarray(state.violation)
+        steps += active
     return steps
 
 
-def test_robots_fall_as_often_on_both_backends():
-    """Share of falls within 200 steps, and steps before the fall: they differ by less than three standard errors."""
-    one, other = (walk(backend, 200) for backend in BACKENDS)
+@each_robot
+def test_robots_violate_as_often_on_both_backends(name):
+    """Share of violations within 200 steps, and steps before them: they differ by less than three standard errors."""
+    one, other = (act(name, backend, 200) for backend in BACKENDS)
     share, other_share = np.mean(one < 200), np.mean(other < 200)
     mean = (share + other_share) / 2
-    print(f"falls: {share:.3f}, {other_share:.3f}; mean steps before them: {one.mean():.1f}, {other.mean():.1f}")
+    print(f"{name}: violations {share:.3f}, {other_share:.3f}; mean steps before them: {one.mean():.1f}, {other.mean():.1f}")
     assert 0 < mean < 1
     assert abs(share - other_share) < 3 * np.sqrt(2 * mean * (1 - mean) / NUM_ROBOTS)
     assert abs(one.mean() - other.mean()) < 3 * np.sqrt((one.var() + other.var()) / NUM_ROBOTS)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_inactive_robots_keep_their_state(backend, recorded):
-    states, actions = mixed(recorded)
+@each_robot
+@each_backend
+def test_inactive_robots_keep_their_state(name, backend):
+    states, controls = mixed(name)
     states = states._replace(diverged=np.arange(NUM_ROBOTS) % 4 == 0)
     active = np.arange(NUM_ROBOTS) % 2 == 1
-    after = robots(backend).move(states, actions, active)
+    after = mover(name, backend)(states, controls, active)
     assert_same(rows(after, ~active), rows(states, ~active))
     assert not np.any(np.all(after.qpos[active] == states.qpos[active], axis=1))
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_neighbours_do_not_matter(backend, recorded):
-    states, actions = mixed(recorded)
-    after = robots(backend).move(states, actions)
+@each_robot
+@each_backend
+def test_neighbours_do_not_matter(name, backend):
+    states, controls = mixed(name)
+    move = mover(name, backend)
+    after = move(states, controls)
     others = np.roll(np.arange(NUM_ROBOTS), 7)
-    assert_same(robots(backend).move(rows(states, others), actions[others]), rows(after, others))
+    assert_same(move(rows(states, others), controls[others]), rows(after, others))
     alone = np.arange(NUM_ROBOTS) == 5
-    assert_same(rows(robots(backend).move(states, actions, alone), 5), rows(after, 5))
+    assert_same(rows(move(states, controls, alone), 5), rows(after, 5))
 
 
-def test_number_of_threads_does_not_matter(monkeypatch, recorded):
-    states, actions = mixed(recorded)
+@each_robot
+def test_number_of_threads_does_not_matter(name, monkeypatch):
+    states, controls = mixed(name)
     results = []
     for threads in (1, 2, 5):
         monkeypatch.setenv("FLEETJAX_NUM_THREADS", str(threads))
         assert native.num_threads() == threads
-        physics = make_physics("humanoid.xml", substeps=SUBSTEPS, backend="native")
-        results.append(jax.jit(jax.vmap(physics.step))(states, actions, np.ones(NUM_ROBOTS, bool)))
+        results.append(jax.jit(jax.vmap(physics_of(name).step))(states, controls, np.ones(NUM_ROBOTS, bool)))
     for result in results[1:]:
         assert_same(result, results[0])
 
@@ -190,22 +182,23 @@ def test_number_of_threads_does_not_matter(monkeypatch, recorded):
 SICK = {"control": 3, "velocity": 20, "position": 21}
 
 
-def infect(states: PhysicsState, actions):
-    """Return states and actions in which three robots are bound to diverge."""
-    qpos, qvel, actions = states.qpos.copy(), states.qvel.copy(), actions.copy()
-    actions[SICK["control"], 2] = np.nan
+def infect(states: PhysicsState, controls):
+    """Return states and controls in which three robots are bound to diverge."""
+    qpos, qvel, controls = states.qpos.copy(), states.qvel.copy(), controls.copy()
+    controls[SICK["control"], 2] = np.nan
     qvel[SICK["velocity"], 10] = 1e12
     qpos[SICK["position"], 8] = np.inf
-    return states._replace(qpos=qpos, qvel=qvel), actions
+    return states._replace(qpos=qpos, qvel=qvel), controls
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_diverged_robot_keeps_its_last_state_and_spares_the_others(backend, recorded, monkeypatch, tmp_path):
+@each_robot
+@each_backend
+def test_a_diverged_robot_keeps_its_last_state_and_spares_the_others(name, backend, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    states, actions = mixed(recorded)
-    healthy = robots(backend).move(states, actions)
-    sick_states, sick_actions = infect(states, actions)
-    after = robots(backend).move(sick_states, sick_actions)
+    states, controls = mixed(name)
+    healthy = mover(name, backend)(states, controls)
+    sick_states, sick_controls = infect(states, controls)
+    after = mover(name, backend)(sick_states, sick_controls)
     sick = np.isin(np.arange(NUM_ROBOTS), list(SICK.values()))
     np.testing.assert_array_equal(after.diverged, sick)
     assert_same(rows(after._replace(diverged=sick_states.diverged), sick), rows(sick_states, sick))
@@ -213,17 +206,17 @@ def test_a_diverged_robot_keeps_its_last_state_and_spares_the_others(backend, re
     assert list(tmp_path.iterdir()) == []  # MuJoCo's log would be here
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_diverged_robot_is_a_violation(backend, recorded):
-    states, actions = mixed(recorded)
-    actions = actions.copy()
-    actions[SICK["control"]] = np.nan
-    before = jax.vmap(envs.begin)(states, jnp.zeros((NUM_ROBOTS, robots(backend).env.spec.observation_size)))
-    after = robots(backend).step(before, actions)
-    assert after.violation[SICK["control"]]
-    assert after.reward[SICK["control"]] == -1
+@each_robot
+def test_a_diverged_robot_is_a_violation(name):
+    env = ROBOTS[name].module.make_env(backend="native")
+    before = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 2), jnp.arange(2))
+    action = jnp.zeros((2, env.spec.action_size)).at[0].set(jnp.nan)
+    after = jax.vmap(env.step)(before, action, jnp.ones(2, bool), jax.random.split(jax.random.key(1), 2))
+    np.testing.assert_array_equal(after.violation, [True, False])
+    assert after.reward[0] == (-1 if name == "humanoid" else 0)
     assert np.all(np.isfinite(after.obs))
-    np.testing.assert_array_equal(after.physics.qpos[SICK["control"]], states.qpos[SICK["control"]])
+    bodies = [ROBOTS[name].body(state.physics) for state in (before, after)]
+    assert_same(bodies[1].qpos[0], bodies[0].qpos[0])
 
 
 LEG = """
@@ -247,7 +240,7 @@ LEG = """
 def test_mjx_is_differentiable_forwards():
     """On a smooth case, a leg that swings, the derivative of a control step equals central differences of MJX itself."""
     leg = mujoco.MjModel.from_xml_string(LEG)
-    step = mjx.make_step(leg, SUBSTEPS)
+    step = mjx.make_step(leg, 3)
     start = PhysicsState(
         qpos=jnp.asarray(leg.qpos0, jnp.float32).at[1].set(0.4),
         qvel=jnp.linspace(-0.5, 0.5, leg.nv),
@@ -277,13 +270,13 @@ def test_mjx_is_differentiable_forwards():
 def test_backends_are_resolved():
     assert resolve_backend("auto") == ("native" if jax.default_backend() == "cpu" else "mjx")
     with pytest.raises(ValueError, match="backend = 'cuda' is unknown; choose one of auto, native, mjx"):
-        make_physics("humanoid.xml", substeps=SUBSTEPS, backend="cuda")
+        make_physics("humanoid.xml", substeps=3, backend="cuda")
 
 
 def test_native_refuses_implicit_damping():
     implicit = mujoco.MjModel.from_xml_string(LEG.replace('<flag eulerdamp="disable"/>', ""))
     with pytest.raises(ValueError, match="eulerdamp disabled"):
-        native.make_step(implicit, SUBSTEPS)
+        native.make_step(implicit, 3)
 
 
 def test_importing_mjx_prints_nothing():

@@ -1,6 +1,7 @@
 """Environments: the contract, the registry, and the environments that ship."""
 
 import functools
+import importlib
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -34,10 +35,11 @@ class _Entry(NamedTuple):
     defaults: Mapping[str, Any]
 
 
-def _humanoid(backend: str) -> Env:
-    from fleetjax.envs import humanoid
+def _robot(name: str) -> Callable[[str], Env]:
+    def make_env(backend: str) -> Env:
+        return importlib.import_module(f"fleetjax.envs.{name}").make_env(backend=backend)
 
-    return humanoid.make_env(backend=backend)
+    return make_env
 
 
 def _navigation(backend: str) -> Env:
@@ -48,7 +50,10 @@ def _navigation(backend: str) -> Env:
 
 
 _ENVS: dict[str, _Entry] = {
-    "humanoid": _Entry(_humanoid, {"uncertainty_threshold": 0.05, "random_threshold": 0.99807, "initial_period": 1000}),
+    "humanoid": _Entry(
+        _robot("humanoid"), {"uncertainty_threshold": 0.05, "random_threshold": 0.99807, "initial_period": 1000}
+    ),
+    "anymal": _Entry(_robot("anymal"), {"uncertainty_threshold": 0.05, "initial_period": 250}),
     "navigation": _Entry(
         _navigation,
         {

@@ -62,8 +62,7 @@ def make_env(*, backend: str = "auto") -> base.Env:
     def step(state: EnvState, action: jax.Array, active: jax.Array, key: jax.Array) -> EnvState:
         del key  # deterministic
         action = jnp.clip(action, -1.0, 1.0)
-        target = low + (action + 1) / 2 * (high - low)
-        hand = state.physics._replace(body=physics.step(state.physics.body, target, active))
+        hand = state.physics._replace(body=physics.step(state.physics.body, targets(action, low, high), active))
         distance = jnp.linalg.norm(hand.body.qpos[16:19] - GOAL_POSITION)
         violation = (distance >= DROP_DISTANCE) | hand.body.diverged
         angle = angle_between(hand.body.qpos[19:23], hand.goal)
@@ -89,6 +88,11 @@ def make_env(*, backend: str = "auto") -> base.Env:
     return base.Env(reset, step, spec, next_goal, base.Scene(physics.model, pose))
 
 
+def targets(action: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
+    """Return the angles f32[16] (rad) that the servos hold for an action f32[16] in [-1, 1], given the joints' limits."""
+    return low + (action + 1) / 2 * (high - low)
+
+
 def draw_orientation(key: jax.Array) -> jax.Array:
     """Return a random orientation f32[4]: a turn about the world's y, then one about its x, each uniform in [-pi, pi]."""
     half = jnp.pi / 2 * jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0)
@@ -108,12 +112,13 @@ def observe(hand: Hand, action: jax.Array, low: jax.Array, high: jax.Array) -> j
     """
     body = hand.body
     angles, velocities, orientation = body.qpos[:16], body.qvel[:16], body.qpos[19:23]
-    target = low + (action + 1) / 2 * (high - low)
-    torques = jnp.clip(STIFFNESS * (target - angles) - DAMPING * velocities, -LARGEST_TORQUE, LARGEST_TORQUE)
+    torques = jnp.clip(
+        STIFFNESS * (targets(action, low, high) - angles) - DAMPING * velocities, -LARGEST_TORQUE, LARGEST_TORQUE
+    )
     entries = [
         (2 * angles - high - low) / (high - low),
         0.2 * velocities,
-        10.0 * torques,
+        10.0 * jnp.clip(torques, -LARGEST_TORQUE, LARGEST_TORQUE),
         body.qpos[16:19],
         _scalar_last(orientation),
         body.qvel[16:19],

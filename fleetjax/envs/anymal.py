@@ -71,7 +71,7 @@ def make_env(*, backend: str = "auto", success_return: float | None = None) -> b
     def step(state: EnvState, action: jax.Array, active: jax.Array, key: jax.Array) -> EnvState:
         del key  # deterministic
         action = jnp.clip(action, -1.0, 1.0)
-        target = jnp.asarray(DEFAULT_ANGLES) + ACTION_SCALE * action
+        target = targets(action)
         walker = state.physics._replace(body=physics.step(state.physics.body, target, active))
         violation = jnp.any(walker.body.sensors > CONTACT_FORCE) | walker.body.diverged
         return base.proceed(
@@ -87,6 +87,11 @@ def make_env(*, backend: str = "auto", success_return: float | None = None) -> b
     return base.Env(
         reset, step, spec, scene=base.Scene(physics.model, lambda state: (state.physics.body.qpos, jnp.zeros((0, 7))))
     )
+
+
+def targets(action: jax.Array) -> jax.Array:
+    """Return the angles f32[12] (rad) that the servos hold for an action f32[12] in [-1, 1]."""
+    return jnp.asarray(DEFAULT_ANGLES) + ACTION_SCALE * action
 
 
 def base_velocity(body: PhysicsState) -> tuple[jax.Array, jax.Array]:

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from fleetjax.config import Config
@@ -98,15 +99,14 @@ def group(runs: Sequence[tuple[Config, int, Metrics]]) -> list[Curves]:
 
 
 def _labels(settings: Sequence[dict[str, Any]]) -> list[str]:
-    """Return a name for each setting: the algorithm, and the fields in which settings of that algorithm differ."""
+    """Return a name for each setting: the algorithm, and the fields in which settings differ that share it and the place."""
     names = []
     for fields in settings:
         alike = [other for other in settings if all(other[name] == fields[name] for name in ("algorithm", "environment"))]
         differing = [name for name in fields if any(other[name] != fields[name] for other in alike)]
         if len(differing) > 1 and "human_capacity" in differing:
             differing.remove("human_capacity")  # it follows from the others
-        place = [fields["environment"]] * (len({other["environment"] for other in settings}) > 1)
-        names.append(", ".join([text.label(fields["algorithm"]), *place, *(f"{name} {fields[name]}" for name in differing)]))
+        names.append(", ".join([text.label(fields["algorithm"]), *(f"{name} {fields[name]}" for name in differing)]))
     return names
 
 
@@ -114,35 +114,42 @@ def draw(groups: Sequence[Curves], title: str = "") -> Figure:
     """Draw each group in every panel: the mean over its seeds, and a band of one standard deviation.
 
     Args:
-        groups: what to draw.
+        groups: what to draw; each environment has its own row of panels.
         title: takes the place of the legend.
     """
     with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(12.5, 3.1), layout=ConstrainedLayoutEngine(w_pad=0.12))
-        axes = figure.subplots(1, len(PANELS))
-        styles = _styles([curves.algorithm for curves in groups])
-        labels = [curves.label for curves in groups]
-        if len({len(curves.values) for curves in groups}) > 1:
-            labels = [f"{curves.label} ({text.plural(len(curves.values), 'seed')})" for curves in groups]
-        for panel, (ax, name) in enumerate(zip(axes, PANELS, strict=True)):
-            _prepare_axes(ax, name)
-            for curves, label, (colour, dashes) in zip(groups, labels, styles, strict=True):
-                seeds = curves.values[:, panel]
-                t, mean = np.arange(1, seeds.shape[1] + 1), seeds.mean(axis=0)
-                ax.plot(t, mean, color=colour, linestyle=dashes, linewidth=1.8, label=label)
-                if len(seeds) > 1:
-                    deviation = seeds.std(axis=0, ddof=1)
-                    ax.fill_between(t, mean - deviation, mean + deviation, color=colour, alpha=0.2, linewidth=0)
-            ax.set_xlim(0, max(curves.values.shape[2] for curves in groups))
-            ax.set_ylim(bottom=0)
+        places = list(dict.fromkeys(curves.environment for curves in groups))
+        figure = Figure(figsize=(12.5, 0.5 + 2.6 * len(places)), layout=ConstrainedLayoutEngine(w_pad=0.12))
+        axes = figure.subplots(len(places), len(PANELS), squeeze=False)
+        numbers = {len(curves.values) for curves in groups}
+        legend: dict[str, Line2D] = {}
+        styles = _styles(groups)
+        for row, place in zip(axes, places, strict=True):
+            here = [(curves, style) for curves, style in zip(groups, styles, strict=True) if curves.environment == place]
+            for panel, (ax, name) in enumerate(zip(row, PANELS, strict=True)):
+                _prepare_axes(ax, name)
+                for curves, (colour, dashes) in here:
+                    seeds = curves.values[:, panel]
+                    label = f"{curves.label} ({text.plural(len(seeds), 'seed')})" if len(numbers) > 1 else curves.label
+                    t, mean = np.arange(1, seeds.shape[1] + 1), seeds.mean(axis=0)
+                    (line,) = ax.plot(t, mean, color=colour, linestyle=dashes, linewidth=1.8, label=label)
+                    legend.setdefault(label, line)
+                    if len(seeds) > 1:
+                        deviation = seeds.std(axis=0, ddof=1)
+                        ax.fill_between(t, mean - deviation, mean + deviation, color=colour, alpha=0.2, linewidth=0)
+                ax.set_xlim(0, max(curves.values.shape[2] for curves, _ in here))
+                ax.set_ylim(bottom=0)
+            if len(places) > 1:
+                row[0].set_ylabel(place, fontsize=10)
         if title:  # it says what the only line is
             figure.suptitle(title, x=0.008, ha="left", fontsize=11)
         else:
+            labels = list(legend)
             columns = max(1, min(len(labels), _LEGEND_WIDTH // (7 + max(map(len, labels)))))
             figure.legend(
-                axes[0].get_lines(), labels, loc="outside upper left", ncols=columns, alignment="left", title=_note(groups)
+                list(legend.values()), labels, loc="outside upper left", ncols=columns, alignment="left", title=_note(groups)
             )
-            figure.set_figheight(3.1 + 0.24 * -(-len(labels) // columns))
+            figure.set_figheight(figure.get_figheight() + 0.24 * -(-len(labels) // columns))
     return figure
 
 
@@ -165,16 +172,16 @@ def _prepare_axes(ax: Axes, name: str) -> None:
         ax.yaxis.set_major_formatter(counts)
 
 
-def _styles(algorithms: Sequence[str]) -> list[tuple[str, Any]]:
-    """Return colour and dashes of each line: an algorithm's own colour, dashes where it comes again."""
-    spare = iter(colour for colour in _OTHERS if colour not in {_COLOURS.get(a) for a in algorithms})
+def _styles(groups: Sequence[Curves]) -> list[tuple[str, Any]]:
+    """Return colour and dashes of each line: an algorithm's own colour, dashes where it comes again with another label."""
+    names = list(dict.fromkeys(curves.algorithm for curves in groups))
+    spare = iter(colour for colour in _OTHERS if colour not in {_COLOURS.get(name) for name in names})
     colours = dict(_COLOURS)
-    styles = []
-    for i, algorithm in enumerate(algorithms):
-        if algorithm not in colours:
-            colours[algorithm] = next(spare, _OTHERS[i % len(_OTHERS)])
-        styles.append((colours[algorithm], _DASHES[algorithms[:i].count(algorithm) % len(_DASHES)]))
-    return styles
+    for i, name in enumerate(names):
+        if name not in colours:
+            colours[name] = next(spare, _OTHERS[i % len(_OTHERS)])
+    labels = {name: list(dict.fromkeys(c.label for c in groups if c.algorithm == name)) for name in names}
+    return [(colours[c.algorithm], _DASHES[labels[c.algorithm].index(c.label) % len(_DASHES)]) for c in groups]
 
 
 def render(figure: Figure, suffix: str = ".png") -> bytes:

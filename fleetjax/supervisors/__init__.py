@@ -36,7 +36,11 @@ def _shipped(name: str) -> Callable[[Env], Supervisor]:
     return make_supervisor
 
 
-_SUPERVISORS: dict[str, Callable[[Env], Supervisor]] = {"humanoid": _shipped("humanoid"), "navigation": _navigation}
+_SUPERVISORS: dict[str, Callable[[Env], Supervisor]] = {
+    "humanoid": _shipped("humanoid"),
+    "anymal": _shipped("anymal"),
+    "navigation": _navigation,
+}
 
 
 def register_supervisor(name: str, make_supervisor: Callable[[Env], Supervisor]) -> None:

@@ -8,8 +8,24 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import rollout
 
 import fleetjax
+from fleetjax.envs import allegro_hand, anymal, humanoid
+from fleetjax.physics.base import MODELS, PhysicsState
+from fleetjax.physics.native import num_threads
+
+# Substeps of a control step, and `(action, model) -> controls`.
+ROBOTS: dict[str, tuple[int, Callable[[jax.Array, mujoco.MjModel], jax.Array]]] = {
+    "humanoid": (humanoid.SUBSTEPS, lambda action, model: action),
+    "anymal": (anymal.SUBSTEPS, lambda action, model: anymal.targets(action)),
+    "allegro_hand": (
+        allegro_hand.SUBSTEPS,
+        lambda action, model: allegro_hand.targets(action, *jnp.float32(model.jnt_range[:16].T)),
+    ),
+}
 
 
 def seconds(function: Callable[..., Any], *args: Any) -> tuple[float, Any]:
@@ -23,6 +39,38 @@ def median_seconds(function: Callable[..., Any], *args: Any, repeats: int = 5) -
     """Return the median seconds of `repeats` runs, after one that compiles."""
     jax.block_until_ready(function(*args))
     return statistics.median(seconds(function, *args)[0] for _ in range(repeats))
+
+
+def body_of(physics: Any) -> PhysicsState:
+    """Return what the physics backends step, out of an environment's own state."""
+    return physics if isinstance(physics, PhysicsState) else physics.body
+
+
+class RawRollout:
+    """One control step of many robots by MuJoCo alone, with the library's threads and substeps."""
+
+    def __init__(self, environment: str):
+        self.substeps, self.control = ROBOTS[environment]
+        self.model = mujoco.MjModel.from_xml_path(str(MODELS / f"{environment}.xml"))
+        self.model.vis.global_.bvactive = 0
+        self.data = [mujoco.MjData(self.model) for _ in range(num_threads())]
+        self.pool = rollout.Rollout(nthread=num_threads())
+
+    def seconds(self, body: PhysicsState, action: jax.Array, *, calls: int = 50) -> float:
+        """Return seconds for the control step of these robots, the mean of several calls.
+
+        Args:
+            body: states of the robots, PhysicsState[N].
+            action: f32[N, A].
+            calls: how often the same step is taken.
+        """
+        control = np.asarray(self.control(action, self.model), np.float64)[:, None].repeat(self.substeps, axis=1)
+        state = jax.tree.map(lambda x: np.asarray(x, np.float64), body)
+        start = np.concatenate([state.time[:, None], state.qpos, state.qvel], axis=1)
+        begin = time.perf_counter()
+        for _ in range(calls):
+            self.pool.rollout(self.model, self.data, start, control, initial_warmstart=state.warmstart)
+        return (time.perf_counter() - begin) / calls
 
 
 def quick_config(environment: str, algorithm: str = "cur", **overrides: Any) -> fleetjax.Config:
@@ -97,13 +145,3 @@ def table(rows: list[dict[str, Any]]) -> str:
     widths = [max(len(line[i]) for line in cells) for i in range(len(names))]
     lines = ["| " + " | ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True)) + " |" for line in cells]
     return "\n".join([lines[0], "|" + "|".join("-" * (width + 1) + ":" for width in widths) + "|", *lines[1:]])
-
-
-def as_milliseconds(value: float) -> str:
-    """Return seconds as milliseconds with two decimals."""
-    return f"{value * 1e3:.2f}"
-
-
-def moving_rows(state: fleetjax.FleetState) -> jax.Array:
-    """Return the indices of the robots that are not in violation."""
-    return jnp.flatnonzero(~state.env.violation)

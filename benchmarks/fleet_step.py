@@ -1,78 +1,75 @@
-"""Time a C.U.R. timestep on Humanoid at the paper's scale beside what it cannot do without, in one process.
+"""Time a C.U.R. timestep of each robot at the paper's scale beside what it cannot do without, in one process.
 
-    python benchmarks/fleet_step.py [--steps 200] [--repeats 7]
+    python benchmarks/fleet_step.py [ENVIRONMENT ...] [--steps 200] [--repeats 7]
 
 The bound is raw `mujoco.rollout` for the robots that move, from the same states with the same substeps and threads, plus
-the gradient steps' operations at the rate of a large matrix product. All three are measured in turn, the medians count.
+the gradient steps' operations at the rate of a large matrix product. The environment's step, compiled by itself, tells
+physics' share of the time. All are measured in turn, the medians count.
 """
 
 import argparse
 import statistics
-import time
 
 import jax
-import mujoco
+import jax.numpy as jnp
 import numpy as np
-from common import gradient_step_operations, matrix_rate, seconds, stretch
-from mujoco import rollout
+from common import ROBOTS, RawRollout, body_of, gradient_step_operations, matrix_rate, seconds, stretch, table
 
 import fleetjax
-from fleetjax.envs import humanoid
-from fleetjax.physics.base import MODELS
-from fleetjax.physics.native import num_threads
 
 
-def raw_rollout(state: fleetjax.FleetState, *, calls: int = 50):
-    """Return seconds of one control step of the moving robots by MuJoCo alone, and their number."""
-    model = mujoco.MjModel.from_xml_path(str(MODELS / "humanoid.xml"))
-    model.vis.global_.bvactive = 0
-    rows = np.flatnonzero(~np.asarray(state.env.violation))
-    body = jax.tree.map(lambda x: np.asarray(x, np.float64)[rows], state.env.physics)
-    start = np.concatenate([body.time[:, None], body.qpos, body.qvel], axis=1)
-    action = np.asarray(state.env.obs, np.float64)[rows, -model.nu :]
-    control = np.repeat(action[:, None], humanoid.SUBSTEPS, axis=1)
-    data = [mujoco.MjData(model) for _ in range(num_threads())]
-    with rollout.Rollout(nthread=num_threads()) as pool:
-        begin = time.perf_counter()
-        for _ in range(calls):
-            pool.rollout(model, data, start, control, initial_warmstart=body.warmstart)
-        return (time.perf_counter() - begin) / calls, rows.size
+def measure(environment: str, *, num_steps: int, repeats: int) -> dict[str, str]:
+    """Return a row of the table."""
+    # No initial period: in it robots in violation lie still, and few would move.
+    config = fleetjax.make_config(environment, "cur", initial_period=0, backend="native")
+    env = fleetjax.envs.make(environment, "native")
+    key = jax.random.key(0)
+    run = stretch(config, num_steps)
+    state = run(key, jax.jit(fleetjax.prepare)(config, key)).state
+    raw, rate = RawRollout(environment), matrix_rate()
+    operations = gradient_step_operations(config, env.spec)
+    keys = jax.random.split(key, config.num_robots)
+    physics_step = jax.jit(lambda s: jax.vmap(env.step)(s, s.obs[:, -env.spec.action_size :], ~s.violation, keys))
+    jax.block_until_ready(physics_step(state.env))
+
+    steps, bounds, physics, rates, moving = [], [], [], [], []
+    for _ in range(repeats):
+        rows = np.flatnonzero(~np.asarray(state.env.violation))
+        standing = jax.tree.map(lambda x, rows=rows: x[rows], state.env)
+        bound = raw.seconds(body_of(standing.physics), standing.obs[:, -env.spec.action_size :]) / rows.size
+        physics.append(statistics.median(seconds(physics_step, state.env)[0] for _ in range(20)) / rows.size)
+        elapsed, result = seconds(run, key, state)
+        state = result.state
+        moving.append(float(jnp.mean(result.metrics.moving)))
+        steps.append(elapsed / num_steps)
+        bounds.append(bound * moving[-1])
+        physics[-1] *= moving[-1]
+        rates.append(rate())
+    step, bound, own, speed = (statistics.median(x) for x in (steps, bounds, physics, rates))
+    learning = operations / speed
+    return {
+        "environment": environment,
+        "moving": f"{100 * statistics.median(moving) / config.num_robots:.0f} %",
+        "timestep ms": f"{1e3 * step:.1f}",
+        "physics ms": f"{1e3 * own:.1f}",
+        "physics share": f"{100 * own / step:.0f} %",
+        "raw rollout ms": f"{1e3 * bound:.1f}",
+        "gradient bound ms": f"{1e3 * learning:.1f}",
+        "GFLOP/s": f"{speed / 1e9:.0f}",
+        "ratio to bounds": f"{step / (bound + learning):.2f}",
+    }
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "environments", nargs="*", choices=[*ROBOTS, []], default=[e for e in ROBOTS if e in fleetjax.list_envs()]
+    )
     parser.add_argument("--steps", type=int, default=200, help="timesteps in a timed stretch")
     parser.add_argument("--repeats", type=int, default=7, help="timed stretches")
     args = parser.parse_args()
-
-    # No initial period: in it robots in violation lie still, and few would move.
-    config = fleetjax.make_config("humanoid", "cur", initial_period=0, backend="native")
-    key = jax.random.key(0)
-    run = stretch(config, args.steps)
-    state = jax.jit(fleetjax.prepare)(config, key)
-    state = run(key, state).state
-    rate = matrix_rate()
-    operations = gradient_step_operations(config, fleetjax.envs.make("humanoid", "native").spec)
-
-    steps, physics, rates, moving = [], [], [], []
-    for _ in range(args.repeats):
-        before, robots_before = raw_rollout(state)
-        elapsed, result = seconds(run, key, state)
-        state = result.state
-        after, robots_after = raw_rollout(state)
-        share = float(result.metrics.moving.mean())
-        steps.append(elapsed / args.steps)
-        physics.append((before / robots_before + after / robots_after) / 2 * share)
-        rates.append(rate())
-        moving.append(share / config.num_robots)
-    step, raw, speed = (statistics.median(x) for x in (steps, physics, rates))
-    learning = operations / speed
-    print(f"moving robots            {100 * statistics.median(moving):8.1f} %")
-    print(f"whole timestep           {step * 1e3:8.2f} ms   (paper scale, T = 10 000: {step * 1e4:.0f} s)")
-    print(f"bound: raw rollout       {raw * 1e3:8.2f} ms   ({3 * 100 * statistics.median(moving) / raw:,.0f} physics steps/s)")
-    print(f"bound: gradient steps    {learning * 1e3:8.2f} ms   ({operations / 1e9:.2f} GFLOP at {speed / 1e9:.0f} GFLOP/s)")
-    print(f"ratio to the bound       {step / (raw + learning):8.2f}")
+    print(table([measure(name, num_steps=args.steps, repeats=args.repeats) for name in args.environments]))
 
 
 if __name__ == "__main__":

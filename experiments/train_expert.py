@@ -171,7 +171,7 @@ TRAININGS = {
             Stage(
                 LARGE_BATCHES | {"discounting": 0.99, "reward_scaling": 5.0, "entropy_cost": 0.0},
                 calm_walking,
-                begins=9_000_000,
+                begins=10_000_000,
                 noise=0.3,
             ),
         ),

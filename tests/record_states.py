@@ -41,7 +41,7 @@ class Robot(NamedTuple):
 
 ROBOTS = {
     "humanoid": Robot(humanoid, lambda action, model: action, lambda physics: physics, 1.0),
-    "anymal": Robot(anymal, lambda action, model: anymal.targets(action), lambda physics: physics.body, 1.0),
+    "anymal": Robot(anymal, lambda action, model: anymal.targets(action), lambda physics: physics.body, 3.0),
     "allegro_hand": Robot(
         allegro_hand,
         lambda action, model: allegro_hand.targets(action, *jnp.float32(model.jnt_range[:16].T)),

@@ -203,6 +203,7 @@ def _render(arguments: argparse.Namespace) -> None:
             shown = {"num_robots": arguments.num_shown, "num_humans": arguments.num_shown}
             config = make_config(config.environment, "expert", **shown, backend=config.backend)
         learner = folder.read_policy(run) if run and policy == "robot" else None
+        render.check_gl()
     folder.check_free(arguments.output, overwrite=arguments.overwrite)
     seed = arguments.seed if arguments.seed is not None else run.seed if run else 0
     key = jax.random.key(seed)

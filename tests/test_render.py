@@ -1,5 +1,7 @@
 """Animations: who is drawn, in which colour, and what is refused."""
 
+import gc
+import importlib
 import io
 
 import jax
@@ -22,7 +24,7 @@ def scene():
 
 def can_draw() -> bool:
     try:
-        render._gl_context(16, 16).free()
+        render.check_gl()
     except ValueError:
         return False
     return True
@@ -89,6 +91,23 @@ def test_render_writes_a_gif(tmp_path, capsys):
     assert "exists already" in refused(capsys, "render", "humanoid", "--output", path)
 
 
+@needs_gl
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # imageio leaves ffmpeg's pipe to the collector
+def test_render_writes_an_mp4(tmp_path, capsys):
+    """Every third of seven timesteps at 33 timesteps a second: three pictures in 3 / 11 seconds."""
+    from imageio import v3
+
+    path = tmp_path / "robots.mp4"
+    few = ("--num-shown", "1", "--num-steps", "7", "--every", "3", "--width", "64")
+    assert cli.main(["render", "humanoid", *few, "--output", str(path)]) == 0
+    pictures, about = v3.imread(path), v3.immeta(path)
+    gc.collect()
+    assert pictures.shape == (3, 48, 64, 3)
+    assert about["fps"] == pytest.approx(1 / (3 * envs.make("humanoid").spec.control_step), rel=0.01)
+    assert pictures.std() > 10
+    assert np.mean(pictures[0] != pictures[-1]) > 0.01
+
+
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
@@ -104,10 +123,13 @@ def test_what_cannot_be_drawn_is_refused(arguments, reason, capsys):
     assert reason in refused(capsys, "render", *arguments)
 
 
-def test_a_machine_without_opengl_is_told_what_to_install(monkeypatch):
-    def missing(name):
-        raise ImportError(name)
+def test_a_machine_without_opengl_is_told_what_to_install_before_anything_runs(monkeypatch, capsys):
+    def missing(name, package=None):
+        if name.startswith("mujoco."):
+            raise ImportError(name)
+        return real(name, package)
 
-    monkeypatch.setattr(render.importlib, "import_module", missing)
-    with pytest.raises(ValueError, match="libosmesa6"):
-        render._gl_context(16, 16)
+    real = importlib.import_module
+    monkeypatch.setattr(importlib, "import_module", missing)
+    monkeypatch.setattr(render, "start", None)
+    assert "libosmesa6" in refused(capsys, "render", "humanoid")

@@ -152,6 +152,15 @@ def _painter(model: mujoco.MjModel, width: int, height: int) -> Iterator[Callabl
         context.free()
 
 
+def check_gl() -> None:
+    """Check that drawing without a screen works here.
+
+    Raises:
+        ValueError: if no OpenGL library is found.
+    """
+    _gl_context(16, 16).free()
+
+
 def _gl_context(width: int, height: int) -> Any:
     """Return an OpenGL context for drawing without a screen: EGL, else OSMesa; MUJOCO_GL picks one.
 

@@ -1,0 +1,78 @@
+"""Shipped experts act as the policies that brax trained."""
+
+import importlib.util
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax.training.acme import running_statistics, specs
+from brax.training.agents.ppo import networks
+
+from fleetjax import envs, supervisors
+from fleetjax.supervisors import expert
+
+SCRIPT = Path(__file__).parents[1] / "experiments" / "train_expert.py"
+
+
+@pytest.fixture(scope="module")
+def train_expert():
+    spec = importlib.util.spec_from_file_location("train_expert", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def trained(train_expert, name):
+    """Return a training, brax's networks, and parameters in which every number matters."""
+    training = train_expert.TRAININGS[name]
+    nets = train_expert.network_factory(training)(11, 3, preprocess_observations_fn=running_statistics.normalize)
+    policy = nets.policy_network.init(jax.random.key(0))
+    policy = jax.tree.map(lambda x: x + 0.1 * jax.random.normal(jax.random.key(1), x.shape), policy)
+    statistics = running_statistics.init_state(specs.Array((11,), jnp.dtype("float32")))
+    draws = 2.0 + 3.0 * jax.random.normal(jax.random.key(2), (50, 11))
+    return training, nets, (running_statistics.update(statistics, draws), policy, None)
+
+
+@pytest.mark.parametrize("name", ["humanoid", "anymal", "allegro_hand"])
+def test_weights_act_as_brax_does(train_expert, name):
+    """tanh of the mean, the clipped mean, or the last action and a part of the clipped mean."""
+    training, nets, params = trained(train_expert, name)
+    obs = 5.0 * jax.random.normal(jax.random.key(3), (40, 11))
+    policy = networks.make_inference_fn(nets)(params[:2], deterministic=True)
+    action = np.clip(policy(obs, jax.random.key(0))[0], -1, 1)
+    if training.step_size:
+        action = np.clip(np.asarray(obs)[:, -3:] + training.step_size * action, -1, 1)
+    weights = train_expert.as_weights(params, training.step_size)
+    np.testing.assert_allclose(expert.policy(weights, obs), action, atol=2e-5)
+    np.testing.assert_allclose(expert.policy(weights, obs[7]), action[7], atol=2e-5)
+    assert np.std(action) > 0.1
+
+
+def test_a_stage_limits_the_noise_and_nothing_else(train_expert):
+    _, _, (_, policy, _) = trained(train_expert, "anymal")
+    limited = train_expert.limit_noise(policy, 0.25)["params"]
+    noise = np.exp(np.asarray(policy["params"]["std_logparam"]["log_value"]))
+    assert noise.max() > 0.25
+    np.testing.assert_allclose(np.exp(limited["std_logparam"]["log_value"]), np.minimum(noise, 0.25), rtol=1e-5)
+    for module in ("MLP_0", "Dense_0"):
+        jax.tree.map(np.testing.assert_array_equal, limited[module], policy["params"][module])
+    _, _, (_, humanoid, _) = trained(train_expert, "humanoid")
+    jax.tree.map(np.testing.assert_array_equal, train_expert.limit_noise(humanoid, 0.25), humanoid)
+
+
+@pytest.mark.parametrize("name", [path.stem for path in Path(expert.__file__).parent.glob("weights/*.npz")])
+def test_every_shipped_expert_has_its_record(name):
+    env = envs.make(name)
+    record = expert.record(name)
+    assert record["environment"] == name
+    assert 0 < record["share_full_length"] <= 1
+    assert record["mean_return_full_length"] >= record["mean_return"]
+    weights = expert.load_weights(name)
+    assert weights["obs_mean"].shape == (env.spec.observation_size,)
+    supervisor = supervisors.make(name, env)
+    state = env.reset(jax.random.key(0), jnp.int32(0))
+    np.testing.assert_array_equal(supervisor.act(state, jax.random.key(0)), expert.policy(weights, state.obs))

@@ -43,13 +43,13 @@ class Stage(NamedTuple):
         reward: `(before, after) -> f32[]`, what PPO sees in place of the task's reward.
         settings: hyper-parameters of PPO besides `SHARED`; the rest are brax's defaults.
         begins: after how many environment steps.
-        noise: the largest standard deviation that actions of a `CLIPPED_NORMAL` policy have at the beginning.
+        noise: standard deviation that actions of a `CLIPPED_NORMAL` policy have at the beginning; None leaves what it was.
     """
 
     settings: dict[str, Any]
     reward: Callable[[EnvState, EnvState], jax.Array] = lambda before, after: after.reward
     begins: int = 0
-    noise: float = 1.0
+    noise: float | None = None
 
 
 class Training(NamedTuple):
@@ -106,7 +106,7 @@ def sure_walking(before: EnvState, after: EnvState) -> jax.Array:
 def change_command(state: EnvState, key: jax.Array) -> EnvState:
     """Give ANYmal another command now and then, every 250 steps in the mean; easy ones are more frequent than in the task."""
     key_when, key_what, key_scale = jax.random.split(key, 3)
-    scale = jnp.minimum(1.0, jax.random.uniform(key_scale, maxval=2.0))
+    scale = jnp.minimum(1.0, jax.random.uniform(key_scale, maxval=3.0))
     command = scale * jax.random.uniform(key_what, (3,), minval=-1.0, maxval=1.0) * anymal.COMMAND_RANGE
     walker = state.physics
     command = jnp.where(jax.random.uniform(key_when) < 1 / 250, command, walker.command)
@@ -176,6 +176,7 @@ TRAININGS = {
             Stage(LARGE_BATCHES | {"discounting": 0.98, "reward_scaling": 3.0}, progress),
             Stage(LARGE_BATCHES | FINE, calm_walking, begins=10_000_000, noise=0.3),
             Stage(LARGE_BATCHES | FINE | {"desired_kl": 0.006}, sure_walking, begins=18_000_000, noise=0.12),
+            Stage(LARGE_BATCHES | FINE | {"desired_kl": 0.01}, sure_walking, begins=25_000_000, noise=0.2),
         ),
     ),
     "humanoid": Training(
@@ -291,12 +292,14 @@ def steps_done(folder: Path) -> int:
     return max(map(steps_of, checkpoints(folder)), default=0)
 
 
-def limit_noise(policy: Any, noise: float) -> Any:
-    """Return the parameters of a policy whose actions have at most this standard deviation; of another kind, as it is."""
-    modules = dict(policy["params"])
-    if "std_logparam" in modules:
-        modules["std_logparam"] = jax.tree.map(lambda x: jnp.minimum(x, jnp.log(noise)), modules["std_logparam"])
-    return {"params": modules}
+def set_noise(policy: Any, noise: float) -> Any:
+    """Return the parameters of a `CLIPPED_NORMAL` policy whose actions have this standard deviation."""
+    return {
+        "params": {
+            **policy["params"],
+            "std_logparam": jax.tree.map(lambda x: jnp.full_like(x, jnp.log(noise)), policy["params"]["std_logparam"]),
+        }
+    }
 
 
 def train_stage(task: Task, folder: Path, *, num_timesteps: int, evaluate_every: int, seed: int) -> None:
@@ -305,7 +308,7 @@ def train_stage(task: Task, folder: Path, *, num_timesteps: int, evaluate_every:
     if done:
         last = checkpoints(folder)[-1]
         statistics, policy, value = serialization.from_bytes(template(task), last.read_bytes())
-        restore = (statistics, limit_noise(policy, task.stage.noise), value)
+        restore = (statistics, set_noise(policy, task.stage.noise) if task.stage.noise else policy, value)
         print(f"going on from {last} at {done:,} steps")
     start = time.time()
 

@@ -144,6 +144,7 @@ LARGE_BATCHES = {
     "desired_kl": 0.012,
     "vf_loss_coefficient": 1.0,
 }
+SMALL_STEPS = {"learning_rate": 3e-5, "desired_kl": 0.006}
 FINE = {"discounting": 0.99, "reward_scaling": 5.0, "entropy_cost": 0.0}
 # Actions from a normal distribution that the environment clips, of a width that does not depend on the state: a wide one
 # keeps the robot moving until it has found a gait. With brax's default, a normal distribution under tanh, ANYmal learns to
@@ -172,11 +173,13 @@ TRAININGS = {
         vary=change_command,
         network=CLIPPED_NORMAL,
         episode_length=1000,
+        # The first 6 million steps ran with two iterations of the solver, the rest with the model's ten.
         stages=(
             Stage(LARGE_BATCHES | {"discounting": 0.98, "reward_scaling": 3.0}, progress),
             Stage(LARGE_BATCHES | FINE, calm_walking, begins=10_000_000, noise=0.3),
-            Stage(LARGE_BATCHES | FINE | {"desired_kl": 0.006}, sure_walking, begins=18_000_000, noise=0.12),
+            Stage(LARGE_BATCHES | FINE | SMALL_STEPS, sure_walking, begins=18_000_000, noise=0.12),
             Stage(LARGE_BATCHES | FINE | {"desired_kl": 0.01}, sure_walking, begins=25_000_000, noise=0.2),
+            Stage(LARGE_BATCHES | FINE | SMALL_STEPS, sure_walking, begins=32_000_000, noise=0.1),
         ),
     ),
     "humanoid": Training(

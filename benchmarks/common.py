@@ -28,6 +28,9 @@ ROBOTS: dict[str, tuple[int, Callable[[jax.Array, mujoco.MjModel], jax.Array]]] 
 }
 
 
+REGISTERED = [name for name in ROBOTS if name in fleetjax.list_envs()]
+
+
 def seconds(function: Callable[..., Any], *args: Any) -> tuple[float, Any]:
     """Run once; return the wall-clock seconds until the result is there, and the result."""
     start = time.perf_counter()

@@ -13,7 +13,7 @@ import statistics
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import ROBOTS, RawRollout, body_of, gradient_step_operations, matrix_rate, seconds, stretch, table
+from common import REGISTERED, RawRollout, body_of, gradient_step_operations, matrix_rate, seconds, stretch, table
 
 import fleetjax
 
@@ -37,13 +37,13 @@ def measure(environment: str, *, num_steps: int, repeats: int) -> dict[str, str]
         rows = np.flatnonzero(~np.asarray(state.env.violation))
         standing = jax.tree.map(lambda x, rows=rows: x[rows], state.env)
         bound = raw.seconds(body_of(standing.physics), standing.obs[:, -env.spec.action_size :]) / rows.size
-        physics.append(statistics.median(seconds(physics_step, state.env)[0] for _ in range(20)) / rows.size)
+        alone = statistics.median(seconds(physics_step, state.env)[0] for _ in range(20)) / rows.size
         elapsed, result = seconds(run, key, state)
         state = result.state
         moving.append(float(jnp.mean(result.metrics.moving)))
         steps.append(elapsed / num_steps)
         bounds.append(bound * moving[-1])
-        physics[-1] *= moving[-1]
+        physics.append(alone * moving[-1])
         rates.append(rate())
     step, bound, own, speed = (statistics.median(x) for x in (steps, bounds, physics, rates))
     learning = operations / speed
@@ -63,9 +63,7 @@ def measure(environment: str, *, num_steps: int, repeats: int) -> dict[str, str]
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "environments", nargs="*", choices=[*ROBOTS, []], default=[e for e in ROBOTS if e in fleetjax.list_envs()]
-    )
+    parser.add_argument("environments", nargs="*", choices=[*REGISTERED, []], default=REGISTERED)
     parser.add_argument("--steps", type=int, default=200, help="timesteps in a timed stretch")
     parser.add_argument("--repeats", type=int, default=7, help="timed stretches")
     args = parser.parse_args()

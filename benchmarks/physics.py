@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from common import ROBOTS, RawRollout, body_of, seconds, table
+from common import REGISTERED, RawRollout, body_of, seconds, table
 
 import fleetjax
 from fleetjax.physics.base import make_physics
@@ -64,9 +64,7 @@ def measure(environment: str, num_robots: int, *, backends: list[str], repeats: 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "environments", nargs="*", choices=[*ROBOTS, []], default=[e for e in ROBOTS if e in fleetjax.list_envs()]
-    )
+    parser.add_argument("environments", nargs="*", choices=[*REGISTERED, []], default=REGISTERED)
     parser.add_argument("--num-robots", type=int, nargs="+", default=[100, 1000])
     parser.add_argument("--largest-mjx", type=int, default=100, help="largest batch on mjx (more wants a GPU)")
     parser.add_argument("--repeats", type=int, default=5)

@@ -9,16 +9,15 @@ import argparse
 from typing import Any
 
 import jax
-from common import ROBOTS, median_seconds, quick_config, step_milliseconds, table
+from common import REGISTERED, median_seconds, quick_config, step_milliseconds, table
 
 import fleetjax
 
 
 def robots(largest_mjx: int, largest_navigation: int) -> None:
     """N = 10 to 10 000 on each robot (native and mjx), to 1 000 000 on navigation; M = N / 10."""
-    bodies = [name for name in ROBOTS if name in fleetjax.list_envs()]
-    cases = [(name, "native", n) for name in bodies for n in (10, 100, 1000, 10_000)]
-    cases += [(name, "mjx", n) for name in bodies for n in (10, 100, 1000, 10_000) if n <= largest_mjx]
+    cases = [(name, "native", n) for name in REGISTERED for n in (10, 100, 1000, 10_000)]
+    cases += [(name, "mjx", n) for name in REGISTERED for n in (10, 100, 1000, 10_000) if n <= largest_mjx]
     cases += [("navigation", "native", 10**k) for k in range(1, 7) if 10**k <= largest_navigation]
     rows = []
     for environment, backend, n in cases:

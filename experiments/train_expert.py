@@ -93,14 +93,19 @@ def progress(before: EnvState, after: EnvState) -> jax.Array:
     return after.reward + 0.03 * reached
 
 
+def trembling(before: EnvState, after: EnvState) -> jax.Array:
+    """Return the squared change f32[] of ANYmal's action."""
+    return jnp.sum((after.obs[36:] - before.obs[36:]) ** 2)
+
+
 def calm_walking(before: EnvState, after: EnvState) -> jax.Array:
     """Return ANYmal's reward, less a little for trembling."""
-    return after.reward - 5e-4 * jnp.sum((after.obs[36:] - before.obs[36:]) ** 2)
+    return after.reward - 5e-4 * trembling(before, after)
 
 
 def sure_walking(before: EnvState, after: EnvState) -> jax.Array:
     """Return the same with less said of trembling, and a violation punished: slow robots fell, fast ones lost return."""
-    return after.reward - 2e-4 * jnp.sum((after.obs[36:] - before.obs[36:]) ** 2) - 1.0 * after.violation
+    return after.reward - 2e-4 * trembling(before, after) - 1.0 * after.violation
 
 
 def change_command(state: EnvState, key: jax.Array) -> EnvState:

@@ -71,7 +71,7 @@ def test_half_of_the_recorded_states_have_three_contacts(name):
     contacts = count_contacts(physics_of(name).model, recorded(name)[0].qpos)
     assert contacts.size >= 64
     assert np.sum(contacts >= 3) >= contacts.size / 2
-    assert contacts.min() < 3
+    assert np.sum(contacts == 0) > 0
 
 
 @each_robot
@@ -120,13 +120,23 @@ def test_mjx_agrees_with_native(name):
         assert rare < tail, field
 
 
+@functools.cache
+def actor(name: str, backend: str):
+    """Return an environment, and `(states, actions, active, key) -> states` of a batch of its robots."""
+    env = ROBOTS[name].module.make_env(backend=backend)
+    return env, compiled(jax.vmap(env.step, in_axes=(0, 0, 0, None)))
+
+
+def starts(env, key):
+    return jax.vmap(env.reset)(jax.random.split(key, NUM_ROBOTS), jnp.arange(NUM_ROBOTS))
+
+
 def act(name: str, backend: str, num_steps: int):
     """Return for each robot the number of steps before its violation, with noise from none to much."""
-    env = ROBOTS[name].module.make_env(backend=backend)
+    env, step = actor(name, backend)
     policy = jax.jit(make_policy(name, env, NUM_ROBOTS))
-    step = compiled(jax.vmap(env.step, in_axes=(0, 0, 0, None)))
     key_reset, key_noise = jax.random.split(jax.random.key(1))
-    state = jax.vmap(env.reset)(jax.random.split(key_reset, NUM_ROBOTS), jnp.arange(NUM_ROBOTS))
+    state = starts(env, key_reset)
     active, steps = np.ones(NUM_ROBOTS, bool), np.zeros(NUM_ROBOTS)
     for key in jax.random.split(key_noise, num_steps):
         state = step(state, policy(state, key), active, key)
@@ -210,16 +220,18 @@ def test_a_diverged_robot_keeps_its_last_state_and_spares_the_others(name, backe
 
 
 @each_robot
-def test_a_diverged_robot_is_a_violation(name):
-    env = ROBOTS[name].module.make_env(backend="native")
-    before = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 2), jnp.arange(2))
-    action = jnp.zeros((2, env.spec.action_size)).at[0].set(jnp.nan)
-    after = jax.vmap(env.step)(before, action, jnp.ones(2, bool), jax.random.split(jax.random.key(1), 2))
-    np.testing.assert_array_equal(after.violation, [True, False])
-    assert after.reward[0] == (-1 if name == "humanoid" else 0)
+@each_backend
+def test_a_diverged_robot_is_a_violation(name, backend):
+    env, step = actor(name, backend)
+    before, sick = starts(env, jax.random.key(0)), SICK["control"]
+    action = np.zeros((NUM_ROBOTS, env.spec.action_size), np.float32)
+    action[sick] = np.nan
+    after = step(before, action, np.ones(NUM_ROBOTS, bool), jax.random.key(1))
+    np.testing.assert_array_equal(after.violation, np.arange(NUM_ROBOTS) == sick)
+    assert after.reward[sick] == (-1 if name == "humanoid" else 0)
     assert np.all(np.isfinite(after.obs))
     bodies = [ROBOTS[name].body(state.physics) for state in (before, after)]
-    assert_same(bodies[1].qpos[0], bodies[0].qpos[0])
+    assert_same(bodies[1].qpos[sick], bodies[0].qpos[sick])
 
 
 LEG = """

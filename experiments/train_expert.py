@@ -14,9 +14,9 @@ import csv
 import functools
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,175 +26,12 @@ from brax.envs.base import State
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks, train
 from flax import linen, serialization
+from trainings import SHARED, TRAININGS, Stage, Training
 
 from fleetjax import tree
-from fleetjax.envs import Env, allegro_hand, anymal, humanoid
-from fleetjax.envs.rotation import angle_between
 from fleetjax.supervisors import expert
-from fleetjax.types import EnvState
 
 PACKAGE_WEIGHTS = Path(expert.__file__).parent / "weights"
-
-
-class Stage(NamedTuple):
-    """A part of a training.
-
-    Attributes:
-        reward: `(before, after) -> f32[]`, what PPO sees in place of the task's reward.
-        settings: hyper-parameters of PPO besides `SHARED`; the rest are brax's defaults.
-        begins: after how many environment steps.
-        noise: standard deviation that actions of a `CLIPPED_NORMAL` policy have at the beginning; None leaves what it was.
-    """
-
-    settings: dict[str, Any]
-    reward: Callable[[EnvState, EnvState], jax.Array] = lambda before, after: after.reward
-    begins: int = 0
-    noise: float | None = None
-
-
-class Training(NamedTuple):
-    """How an expert is trained and judged.
-
-    Attributes:
-        make_env: builds the environment; `success_return` is a keyword.
-        success_floor: the return below which no episode succeeds.
-        measure: name of what is reported beside the return, and `EnvState -> f32[]`, averaged over steps.
-        stages: one after the other.
-        vary: `(EnvState, key) -> EnvState`, a disturbance before each training step.
-        hidden_sizes: units of the hidden layers of policy and value network.
-        network: what else brax's networks are built with.
-        episode_length: of training, in control steps.
-        step_size: where given, the policy's outputs times this are added to the last action, which is the observation's end.
-    """
-
-    make_env: Callable[..., Env]
-    success_floor: float
-    measure: tuple[str, Callable[[EnvState], jax.Array]]
-    episode_length: int
-    stages: tuple[Stage, ...]
-    vary: Callable[[EnvState, jax.Array], EnvState] = lambda state, key: state
-    hidden_sizes: tuple[int, ...] = (256, 128)
-    network: Mapping[str, Any] = {}
-    step_size: float | None = None
-
-
-def progress(before: EnvState, after: EnvState) -> jax.Array:
-    """Return ANYmal's reward, and more for each part of the commanded velocity that it reaches.
-
-    The task's own reward is flat where the robot stands and should run. Standing still earns little here, and nothing is
-    negative, for a robot that only loses learns to fall.
-    """
-    del before
-    linear, angular = anymal.base_velocity(after.physics.body)
-    command = after.physics.command
-    missed = jnp.linalg.norm(linear[:2] - command[:2]) / jnp.maximum(jnp.linalg.norm(command[:2]), 0.3)
-    turning_missed = jnp.abs(angular[2] - command[2]) / jnp.maximum(jnp.abs(command[2]), 0.3)
-    reached = jnp.maximum(1.25 - missed, 0.0) + 0.5 * jnp.maximum(1.25 - turning_missed, 0.0)
-    return after.reward + 0.03 * reached
-
-
-def trembling(before: EnvState, after: EnvState) -> jax.Array:
-    """Return the squared change f32[] of ANYmal's action."""
-    return jnp.sum((after.obs[36:] - before.obs[36:]) ** 2)
-
-
-def calm_walking(before: EnvState, after: EnvState) -> jax.Array:
-    """Return ANYmal's reward, less a little for trembling."""
-    return after.reward - 5e-4 * trembling(before, after)
-
-
-def sure_walking(before: EnvState, after: EnvState) -> jax.Array:
-    """Return the same with less said of trembling, and a violation punished: slow robots fell, fast ones lost return."""
-    return after.reward - 2e-4 * trembling(before, after) - 1.0 * after.violation
-
-
-def change_command(state: EnvState, key: jax.Array) -> EnvState:
-    """Give ANYmal another command now and then, every 250 steps in the mean; easy ones are more frequent than in the task."""
-    key_when, key_what, key_scale = jax.random.split(key, 3)
-    scale = jnp.minimum(1.0, jax.random.uniform(key_scale, maxval=3.0))
-    command = scale * jax.random.uniform(key_what, (3,), minval=-1.0, maxval=1.0) * anymal.COMMAND_RANGE
-    walker = state.physics
-    command = jnp.where(jax.random.uniform(key_when) < 1 / 250, command, walker.command)
-    walker = walker._replace(command=command)
-    return state._replace(physics=walker, obs=anymal.observe(walker, state.obs[36:]))
-
-
-def turning(before: EnvState, after: EnvState) -> jax.Array:
-    """Return the Allegro hand's reward, and more for each radian that the cube comes closer to its goal; a drop costs 20."""
-    hands = (before.physics, after.physics)
-    angle_before, angle_after = (angle_between(hand.body.qpos[19:23], hand.goal) for hand in hands)
-    return after.reward + 10.0 * (angle_before - angle_after) - 20.0 * after.violation
-
-
-SHARED = {
-    "num_envs": 1024,
-    "unroll_length": 16,
-    "batch_size": 64,
-    "num_minibatches": 32,
-    "num_updates_per_batch": 4,
-    "learning_rate": 3e-4,
-    "max_grad_norm": 1.0,
-}
-LARGE_BATCHES = {
-    "clipping_epsilon": 0.2,
-    "entropy_cost": 2e-3,
-    "num_envs": 2048,
-    "unroll_length": 24,
-    "batch_size": 512,
-    "num_minibatches": 4,
-    "num_updates_per_batch": 5,
-    "learning_rate": 5e-4,
-    "learning_rate_schedule": "ADAPTIVE_KL",
-    "learning_rate_schedule_max_lr": 3e-3,
-    "desired_kl": 0.012,
-    "vf_loss_coefficient": 1.0,
-}
-SMALL_STEPS = {"learning_rate": 3e-5, "desired_kl": 0.006}
-FINE = {"discounting": 0.99, "reward_scaling": 5.0, "entropy_cost": 0.0}
-# Actions from a normal distribution that the environment clips, of a width that does not depend on the state: a wide one
-# keeps the robot moving until it has found a gait. With brax's default, a normal distribution under tanh, ANYmal learns to
-# stand, and goes on standing.
-CLIPPED_NORMAL = {
-    "distribution_type": "normal",
-    "noise_std_type": "log",
-    "init_noise_std": 1.0,
-    "mean_kernel_init_fn": lambda: jax.nn.initializers.variance_scaling(0.01, "fan_in", "uniform"),
-}
-TRAININGS = {
-    "allegro_hand": Training(
-        make_env=lambda success_return: allegro_hand.make_env(),
-        success_floor=float("inf"),  # goals count, returns do not
-        measure=("goals_per_step", lambda state: state.success.astype(jnp.float32)),
-        hidden_sizes=(256, 256, 128),
-        network=CLIPPED_NORMAL,
-        step_size=0.3,
-        episode_length=allegro_hand.HORIZON,
-        stages=(Stage(LARGE_BATCHES | {"discounting": 0.99, "reward_scaling": 0.02}, turning),),
-    ),
-    "anymal": Training(
-        make_env=anymal.make_env,
-        success_floor=anymal.SUCCESS_FLOOR,
-        measure=("mean_tracking_error", anymal.tracking_error),
-        vary=change_command,
-        network=CLIPPED_NORMAL,
-        episode_length=1000,
-        # The first 6 million steps ran with two iterations of the solver, the rest with the model's ten.
-        stages=(
-            Stage(LARGE_BATCHES | {"discounting": 0.98, "reward_scaling": 3.0}, progress),
-            Stage(LARGE_BATCHES | FINE, calm_walking, begins=10_000_000, noise=0.3),
-            Stage(LARGE_BATCHES | FINE | SMALL_STEPS, sure_walking, begins=18_000_000, noise=0.12),
-            Stage(LARGE_BATCHES | FINE | {"desired_kl": 0.01}, sure_walking, begins=25_000_000, noise=0.2),
-            Stage(LARGE_BATCHES | FINE | SMALL_STEPS, sure_walking, begins=32_000_000, noise=0.1),
-        ),
-    ),
-    "humanoid": Training(
-        make_env=humanoid.make_env,
-        success_floor=humanoid.SUCCESS_FLOOR,
-        measure=("mean_forward_speed", humanoid.forward_speed),
-        episode_length=humanoid.HORIZON,
-        stages=(Stage({"clipping_epsilon": 0.3, "entropy_cost": 1e-3, "discounting": 0.97, "reward_scaling": 0.1}),),
-    ),
-}
 
 
 def network_factory(training: Training) -> Callable[..., networks.PPONetworks]:
@@ -221,13 +58,14 @@ class Task(BraxEnv):
     """A fleetjax environment as brax sees it; brax's own wrappers reset it and cut its episodes."""
 
     def __init__(self, training: Training, stage: Stage):
-        self.env = training.make_env(success_return=float("inf"))
+        self.env = training.make_env(**stage.options)
         self.training, self.stage = training, stage
 
     def reset(self, rng: jax.Array) -> State:
         """Start an episode."""
         state: Any = self.env.reset(rng, jnp.int32(0))  # brax expects its own kind of state, and looks at none of it
-        return State(state, state.obs, state.reward, jnp.float32(0), {}, {"key": rng})
+        seen = self.training.view(state.obs)
+        return State(state, seen, state.reward, jnp.float32(0), {"successes": jnp.float32(0)}, {"key": rng})
 
     def step(self, state: Any, action: jax.Array) -> State:
         """Take one control step; a violation ends the episode."""
@@ -237,15 +75,19 @@ class Task(BraxEnv):
             action = expert.add_to_last(before.obs, self.training.step_size * jnp.clip(action, -1.0, 1.0))
         after = self.env.step(before, action, jnp.bool_(True), key_step)
         reward, done = self.stage.reward(before, after), after.violation.astype(jnp.float32)
+        success = after.success.astype(jnp.float32)
         info = {**state.info, "key": key_next}
         if self.env.next_goal:
             after = tree.where(after.success, self.env.next_goal(after, key_goal), after)
-        return state.replace(pipeline_state=after, obs=after.obs, reward=reward, done=done, info=info)
+        metrics = {**state.metrics, "successes": success}
+        return state.replace(
+            pipeline_state=after, obs=self.training.view(after.obs), reward=reward, done=done, metrics=metrics, info=info
+        )
 
     @property
     def observation_size(self) -> int:
-        """Length of the observation."""
-        return self.env.spec.observation_size
+        """Length of what the networks see of the observation."""
+        return jax.eval_shape(self.training.view, jnp.zeros(self.env.spec.observation_size)).shape[0]
 
     @property
     def action_size(self) -> int:
@@ -333,6 +175,7 @@ def train_stage(task: Task, folder: Path, *, num_timesteps: int, evaluate_every:
             "episode_return": round(float(metrics["eval/episode_reward"]), 1),
             "episode_return_std": round(float(metrics["eval/episode_reward_std"]), 1),
             "episode_length": round(float(metrics["eval/avg_episode_length"]), 1),
+            "successes": round(float(metrics["eval/episode_successes"]), 2),
         }
         new = not (folder / "curve.csv").exists()
         with (folder / "curve.csv").open("a", newline="") as file:
@@ -392,7 +235,9 @@ def ship(name: str, folder: Path, *, candidates: int, num_episodes: int) -> None
     best = None
     for path in ranked[:candidates]:
         weights = as_weights(serialization.from_bytes(template(task), path.read_bytes()), training.step_size)
-        score = jax.jit(lambda w, key: expert.score(task.env, w, measure, num_episodes=num_episodes, key=key))
+        score = jax.jit(
+            lambda w, key: expert.score(task.env, w, measure, num_episodes=num_episodes, key=key, view=training.view)
+        )
         returns, lengths, measured = map(np.asarray, score(weights, jax.random.key(1)))
         full = lengths == task.env.spec.horizon
         mean = float(returns[full].mean()) if full.any() else float("nan")

@@ -215,3 +215,49 @@ def test_an_action_sets_targets_between_the_limits(physics, step, start):
     data.ctrl[:] = low + (np.clip(action, -1, 1) + 1) / 2 * (high - low)
     mujoco.mj_step(physics.model, data, 4)
     np.testing.assert_allclose(after.physics.body.qpos, data.qpos, atol=1e-5)
+
+
+# What the expert sees
+
+
+@pytest.fixture(scope="module")
+def turned(physics):
+    """Cubes as drawn, and turned onto themselves together with their goals: observations f32[24, 88] of one hand."""
+    cube, goal = Rotation.random(rng=np.random.default_rng(1)), Rotation.random(rng=np.random.default_rng(2))
+    angles = np.linspace(0.3, 0.6, 16)
+    hands = [
+        hand(physics, angles=angles, speeds=0.5, turn=scalar_first(cube * same), goal=scalar_first(goal * same))
+        for same in Rotation.create_group("O")
+    ]
+    return cube, goal, np.stack([allegro_hand.observe(h, jnp.linspace(-1, 1, 16), LOW, HIGH) for h in hands])
+
+
+def test_the_view_is_the_same_for_a_cube_turned_onto_itself(turned):
+    _, _, obs = turned
+    assert np.ptp(obs[:, 51:55], axis=0).min() > 0.5
+    np.testing.assert_allclose(np.ptp(allegro_hand.view(obs), axis=0), 0, atol=2e-6)
+
+
+def test_the_view_entry_by_entry(turned):
+    cube, goal, obs = turned
+    view = np.asarray(allegro_hand.view(obs[0]))
+    np.testing.assert_array_equal(view[:32], obs[0, :32])
+    np.testing.assert_allclose(view[32:35], 0, atol=1e-6)
+    edges = cube.as_matrix()
+    moments = np.einsum("ai,bi,ci,di->abcd", edges, edges, edges, edges)
+    np.testing.assert_allclose(view[35], moments[0, 0, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(view[39], moments[0, 0, 1, 2], atol=1e-6)
+    np.testing.assert_allclose(view[49], moments[2, 2, 2, 2], atol=1e-6)
+    six = np.concatenate([edges.T, -edges.T])
+    np.testing.assert_allclose(view[50:53], six[np.argmax(six[:, 0])], atol=1e-6)
+    np.testing.assert_allclose(view[53:56], six[np.argmax(six[:, 2])], atol=1e-6)
+    np.testing.assert_array_equal(view[56:62], obs[0, 55:61])
+    left = goal * cube.inv()
+    np.testing.assert_allclose(view[62:65], left.as_rotvec(), atol=1e-5)
+    np.testing.assert_allclose(view[65], left.magnitude(), atol=1e-5)
+    np.testing.assert_array_equal(view[66:], obs[0, 72:])
+
+
+def test_the_view_at_the_goal_is_finite(physics):
+    obs = allegro_hand.observe(hand(physics, turn=NO_TURN, goal=NO_TURN), jnp.zeros(16), LOW, HIGH)
+    np.testing.assert_allclose(allegro_hand.view(obs)[62:66], 0, atol=1e-6)

@@ -1,34 +1,24 @@
 """Shipped experts act as the policies that brax trained."""
 
-import importlib.util
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import train_expert
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks
+from trainings import TRAININGS
 
 from fleetjax import envs, supervisors
+from fleetjax.envs import allegro_hand
 from fleetjax.supervisors import expert
 
-SCRIPT = Path(__file__).parents[1] / "experiments" / "train_expert.py"
 
-
-@pytest.fixture(scope="module")
-def train_expert():
-    spec = importlib.util.spec_from_file_location("train_expert", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def trained(train_expert, name):
+def trained(name):
     """Return a training, brax's networks, and parameters in which every number matters."""
-    training = train_expert.TRAININGS[name]
+    training = TRAININGS[name]
     nets = train_expert.network_factory(training)(11, 3, preprocess_observations_fn=running_statistics.normalize)
     policy = nets.policy_network.init(jax.random.key(0))
     policy = jax.tree.map(lambda x: x + 0.1 * jax.random.normal(jax.random.key(1), x.shape), policy)
@@ -38,9 +28,9 @@ def trained(train_expert, name):
 
 
 @pytest.mark.parametrize("name", ["humanoid", "anymal", "allegro_hand"])
-def test_weights_act_as_brax_does(train_expert, name):
+def test_weights_act_as_brax_does(name):
     """tanh of the mean, the clipped mean, or the last action and a part of the clipped mean."""
-    training, nets, params = trained(train_expert, name)
+    training, nets, params = trained(name)
     obs = 5.0 * jax.random.normal(jax.random.key(3), (40, 11))
     policy = networks.make_inference_fn(nets)(params[:2], deterministic=True)
     action = np.clip(policy(obs, jax.random.key(0))[0], -1, 1)
@@ -52,12 +42,27 @@ def test_weights_act_as_brax_does(train_expert, name):
     assert np.std(action) > 0.1
 
 
-def test_a_stage_sets_the_noise_and_nothing_else(train_expert):
-    _, _, (_, policy, _) = trained(train_expert, "anymal")
+def test_a_stage_sets_the_noise_and_nothing_else():
+    _, _, (_, policy, _) = trained("anymal")
     changed = train_expert.set_noise(policy, 0.25)["params"]
     np.testing.assert_allclose(np.exp(changed["std_logparam"]["log_value"]), np.full(3, 0.25), rtol=1e-6)
     for module in ("MLP_0", "Dense_0"):
         jax.tree.map(np.testing.assert_array_equal, changed[module], policy["params"][module])
+
+
+def test_networks_see_the_view_and_a_stage_sets_the_tolerance():
+    training = TRAININGS["allegro_hand"]
+    easy = train_expert.Task(training, training.stages[0]._replace(options={"tolerance": 4.0}))
+    hard = train_expert.Task(training, training.stages[0]._replace(options={"tolerance": 0.0}))
+    state = jax.jit(easy.reset)(jax.random.key(0))
+    assert state.obs.shape == (easy.observation_size,) == (82,)
+    reached, missed = (jax.jit(task.step)(state, jnp.zeros(16)) for task in (easy, hard))
+    assert (float(reached.metrics["successes"]), float(missed.metrics["successes"])) == (1, 0)
+    np.testing.assert_allclose(reached.reward - missed.reward, 2, atol=1e-5)
+    np.testing.assert_array_equal(missed.pipeline_state.physics.goal, state.pipeline_state.physics.goal)
+    assert np.abs(reached.pipeline_state.physics.goal - state.pipeline_state.physics.goal).max() > 1e-3
+    np.testing.assert_allclose(reached.obs, allegro_hand.view(reached.pipeline_state.obs), atol=1e-5)
+    np.testing.assert_allclose(reached.obs[66:], state.obs[66:], atol=1e-6)  # no change of the targets
 
 
 @pytest.mark.parametrize("name", [path.stem for path in Path(expert.__file__).parent.glob("weights/*.npz")])

@@ -4,6 +4,8 @@ Differences from the Isaac Gym task, where a reading of it was unclear or mistak
 readings that are always zero; no joint starts outside its limits; an episode starts with the cube at rest in the hand.
 """
 
+import functools
+import itertools
 from typing import NamedTuple
 
 import jax
@@ -22,6 +24,7 @@ SHOWN_AT = np.array([-0.2, -0.26, 0.64], np.float32)  # m, where pictures show t
 TOLERANCE = 0.1  # rad, within which a goal is reached
 DROP_DISTANCE = 0.24  # m from the goal's position, at which the cube counts as dropped
 STIFFNESS, DAMPING, LARGEST_TORQUE = 3.0, 0.1, 0.5  # N m/rad, N m s/rad, N m
+QUADRUPLES = np.array(list(itertools.combinations_with_replacement(range(3), 4)))  # of axes, whose products are moments
 SETTLED = MODELS / "allegro_hand_settled.npz"  # written by experiments/settle_cubes.py
 
 
@@ -37,11 +40,12 @@ class Hand(NamedTuple):
     goal: jax.Array
 
 
-def make_env(*, backend: str = "auto") -> base.Env:
+def make_env(*, backend: str = "auto", tolerance: float = TOLERANCE) -> base.Env:
     """Build the environment of hand and cube.
 
     Args:
         backend: physics backend.
+        tolerance: rad, within which a goal is reached.
     """
     physics = make_physics("allegro_hand.xml", substeps=SUBSTEPS, backend=backend)
     spec = base.EnvSpec(
@@ -66,7 +70,7 @@ def make_env(*, backend: str = "auto") -> base.Env:
         distance = jnp.linalg.norm(hand.body.qpos[16:19] - GOAL_POSITION)
         violation = (distance >= DROP_DISTANCE) | hand.body.diverged
         angle = angle_between(hand.body.qpos[19:23], hand.goal)
-        success = angle <= TOLERANCE
+        success = angle <= tolerance
         reward = -10.0 * distance + 1.0 / (angle + 0.1) - 2e-4 * jnp.sum(action**2) + 250.0 * success
         return base.proceed(
             state,
@@ -129,6 +133,33 @@ def observe(hand: Hand, action: jax.Array, low: jax.Array, high: jax.Array) -> j
         action,
     ]
     return jnp.clip(jnp.concatenate(entries), -5.0, 5.0)
+
+
+@functools.partial(jnp.vectorize, signature="(88)->(82)")
+def view(obs: jax.Array) -> jax.Array:
+    """Return what the expert sees f32[..., 82] of an observation f32[..., 88].
+
+    A cube that is turned onto itself lies in the hand as before, and what is left to turn does not change: of its
+    orientation only how edges lie matters, not which face is where. So a policy that sees the turn to the goal in the
+    world's frame, and edges without names, knows what to do for 24 orientations once it knows it for one.
+
+    Entries: 0-31 joint angles and velocities; 32-34 the cube's distance from the goal's position; 35-49 fourth moments of its
+    edges' directions; 50-55 the edge nearest to the world's x and the one nearest to its z, each as a unit vector; 56-61
+    velocity and angular velocity; 62-64 the turn that is left as a rotation vector (rad), 65 its angle; 66-81 the action.
+    """
+    orientation, missing = jnp.roll(obs[51:55], 1), conjugate(jnp.roll(obs[68:72], 1))
+    edges = rotation_matrix(orientation)  # in columns
+    moments = jnp.sum(jnp.prod(edges[QUADRUPLES], axis=1), axis=1)
+    upright = jnp.argmax(jnp.abs(edges[2]))
+    sideways = jnp.argmax(jnp.where(jnp.arange(3) == upright, -1.0, jnp.abs(edges[0])))
+    along_z = edges[:, upright] * jnp.sign(edges[2, upright])
+    along_x = edges[:, sideways] * jnp.sign(edges[0, sideways])
+    turn = missing[1:] * jnp.where(missing[0] < 0, -1.0, 1.0)
+    sine = jnp.minimum(1.0, jnp.linalg.norm(turn))
+    angle = 2.0 * jnp.arcsin(sine)
+    turn = turn / jnp.maximum(sine, 1e-6) * angle
+    position = obs[48:51] - obs[61:64]
+    return jnp.concatenate([obs[:32], position, moments, along_x, along_z, obs[55:61], turn, angle[None], obs[72:]])
 
 
 def _scalar_last(quaternion: jax.Array) -> jax.Array:

@@ -51,9 +51,17 @@ def load_weights(name: str) -> dict[str, np.ndarray]:
         return dict(arrays)
 
 
-def policy(weights: Mapping[str, jax.Array | np.ndarray], obs: jax.Array) -> jax.Array:
+View = Callable[[jax.Array], jax.Array]  # f32[..., O] -> f32[..., V]: what a network sees of an observation
+
+
+def everything(obs: jax.Array) -> jax.Array:
+    """Return the observation as it is."""
+    return obs
+
+
+def policy(weights: Mapping[str, jax.Array | np.ndarray], obs: jax.Array, view: View = everything) -> jax.Array:
     """Return the deterministic action f32[..., A] for observations f32[..., O]."""
-    x = (obs - weights["obs_mean"]) / weights["obs_std"]
+    x = (view(obs) - weights["obs_mean"]) / weights["obs_std"]
     layers = sum(name.startswith("kernel") for name in weights)
     for i in range(layers):
         x = x @ weights[f"kernel_{i}"] + weights[f"bias_{i}"]
@@ -74,6 +82,7 @@ def score(
     *,
     num_episodes: int,
     key: jax.Array,
+    view: View = everything,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Run one episode a robot under a policy.
 
@@ -83,6 +92,7 @@ def score(
         measure: `EnvState -> f32[]`, what to add up over an episode's steps.
         num_episodes: robots that run side by side.
         key: random key.
+        view: what the policy sees of an observation.
 
     Returns:
         f32[num_episodes] undiscounted returns, i32[num_episodes] control steps before violation or horizon,
@@ -95,7 +105,7 @@ def score(
         state, total = carry
         key_env, key_goal = jax.random.split(key)
         active = ~state.violation
-        after = jax.vmap(env.step)(state, policy(weights, state.obs), active, jax.random.split(key_env, num_episodes))
+        after = jax.vmap(env.step)(state, policy(weights, state.obs, view), active, jax.random.split(key_env, num_episodes))
         total += jnp.where(active, jax.vmap(measure)(after), 0.0)
         if env.next_goal:
             after = tree.where(after.success, jax.vmap(env.next_goal)(after, jax.random.split(key_goal, num_episodes)), after)

@@ -1,0 +1,201 @@
+"""How the package's experts are trained: environments, rewards, hyper-parameters, stage by stage.
+
+`train_expert.py` runs these tables.
+"""
+
+import functools
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from fleetjax.envs import Env, allegro_hand, anymal, humanoid
+from fleetjax.envs.rotation import angle_between
+from fleetjax.supervisors import expert
+from fleetjax.types import EnvState
+
+
+class Stage(NamedTuple):
+    """A part of a training.
+
+    Attributes:
+        reward: `(before, after) -> f32[]`, what PPO sees in place of the task's reward.
+        settings: hyper-parameters of PPO besides `SHARED`; the rest are brax's defaults.
+        begins: after how many environment steps.
+        options: what `Training.make_env` is given.
+        noise: standard deviation that actions of a `CLIPPED_NORMAL` policy have at the beginning; None leaves what it was.
+    """
+
+    settings: dict[str, Any]
+    reward: Callable[[EnvState, EnvState], jax.Array] = lambda before, after: after.reward
+    begins: int = 0
+    options: Mapping[str, Any] = {}
+    noise: float | None = None
+
+
+class Training(NamedTuple):
+    """How an expert is trained and judged.
+
+    Attributes:
+        make_env: builds the environment.
+        success_floor: the return below which no episode succeeds.
+        measure: name of what is reported beside the return, and `EnvState -> f32[]`, averaged over steps.
+        stages: one after the other.
+        vary: `(EnvState, key) -> EnvState`, a disturbance before each training step.
+        hidden_sizes: units of the hidden layers of policy and value network.
+        network: what else brax's networks are built with.
+        episode_length: of training, in control steps.
+        step_size: where given, the policy's outputs times this are added to the last action, which is the observation's end.
+        view: what the networks see of an observation.
+    """
+
+    make_env: Callable[..., Env]
+    success_floor: float
+    measure: tuple[str, Callable[[EnvState], jax.Array]]
+    episode_length: int
+    stages: tuple[Stage, ...]
+    vary: Callable[[EnvState, jax.Array], EnvState] = lambda state, key: state
+    hidden_sizes: tuple[int, ...] = (256, 128)
+    network: Mapping[str, Any] = {}
+    step_size: float | None = None
+    view: expert.View = expert.everything
+
+
+def progress(before: EnvState, after: EnvState) -> jax.Array:
+    """Return ANYmal's reward, and more for each part of the commanded velocity that it reaches.
+
+    The task's own reward is flat where the robot stands and should run. Standing still earns little here, and nothing is
+    negative, for a robot that only loses learns to fall.
+    """
+    del before
+    linear, angular = anymal.base_velocity(after.physics.body)
+    command = after.physics.command
+    missed = jnp.linalg.norm(linear[:2] - command[:2]) / jnp.maximum(jnp.linalg.norm(command[:2]), 0.3)
+    turning_missed = jnp.abs(angular[2] - command[2]) / jnp.maximum(jnp.abs(command[2]), 0.3)
+    reached = jnp.maximum(1.25 - missed, 0.0) + 0.5 * jnp.maximum(1.25 - turning_missed, 0.0)
+    return after.reward + 0.03 * reached
+
+
+def trembling(before: EnvState, after: EnvState) -> jax.Array:
+    """Return the squared change f32[] of ANYmal's action."""
+    return jnp.sum((after.obs[36:] - before.obs[36:]) ** 2)
+
+
+def calm_walking(before: EnvState, after: EnvState) -> jax.Array:
+    """Return ANYmal's reward, less a little for trembling."""
+    return after.reward - 5e-4 * trembling(before, after)
+
+
+def sure_walking(before: EnvState, after: EnvState) -> jax.Array:
+    """Return the same with less said of trembling, and a violation punished: slow robots fell, fast ones lost return."""
+    return after.reward - 2e-4 * trembling(before, after) - 1.0 * after.violation
+
+
+def change_command(state: EnvState, key: jax.Array) -> EnvState:
+    """Give ANYmal another command now and then, every 250 steps in the mean; easy ones are more frequent than in the task."""
+    key_when, key_what, key_scale = jax.random.split(key, 3)
+    scale = jnp.minimum(1.0, jax.random.uniform(key_scale, maxval=3.0))
+    command = scale * jax.random.uniform(key_what, (3,), minval=-1.0, maxval=1.0) * anymal.COMMAND_RANGE
+    walker = state.physics
+    command = jnp.where(jax.random.uniform(key_when) < 1 / 250, command, walker.command)
+    walker = walker._replace(command=command)
+    return state._replace(physics=walker, obs=anymal.observe(walker, state.obs[36:]))
+
+
+def turning(before: EnvState, after: EnvState) -> jax.Array:
+    """Return for the Allegro hand by how many radians the cube came closer to its goal, 2 for a goal and -1 for a drop.
+
+    The task's own reward also pays for staying near a goal; this one pays for reaching goals fast. Metres that the cube comes
+    closer to the goal's position count 5 times, so that a drop is felt as it begins.
+    """
+    hands = (before.physics.body.qpos, after.physics.body.qpos)
+    angle, angle_after = (angle_between(qpos[19:23], before.physics.goal) for qpos in hands)
+    distance, distance_after = (jnp.linalg.norm(qpos[16:19] - allegro_hand.GOAL_POSITION) for qpos in hands)
+    closer = (angle - angle_after) + 5.0 * (distance - distance_after)
+    return closer + 2.0 * after.success - 1.0 * after.violation
+
+
+SHARED = {
+    "num_envs": 1024,
+    "unroll_length": 16,
+    "batch_size": 64,
+    "num_minibatches": 32,
+    "num_updates_per_batch": 4,
+    "learning_rate": 3e-4,
+    "max_grad_norm": 1.0,
+}
+LARGE_BATCHES = {
+    "clipping_epsilon": 0.2,
+    "entropy_cost": 2e-3,
+    "num_envs": 2048,
+    "unroll_length": 24,
+    "batch_size": 512,
+    "num_minibatches": 4,
+    "num_updates_per_batch": 5,
+    "learning_rate": 5e-4,
+    "learning_rate_schedule": "ADAPTIVE_KL",
+    "learning_rate_schedule_max_lr": 3e-3,
+    "desired_kl": 0.012,
+    "vf_loss_coefficient": 1.0,
+}
+TURNING = LARGE_BATCHES | {
+    "unroll_length": 16,
+    "num_updates_per_batch": 4,
+    "discounting": 0.99,
+    "reward_scaling": 1.0,
+    "desired_kl": 0.016,
+    "entropy_cost": 1e-3,
+}
+SMALL_STEPS = {"learning_rate": 3e-5, "desired_kl": 0.006}
+FINE = {"discounting": 0.99, "reward_scaling": 5.0, "entropy_cost": 0.0}
+# Actions from a normal distribution that the environment clips, of a width that does not depend on the state: a wide one
+# keeps the robot moving until it has found a gait. With brax's default, a normal distribution under tanh, ANYmal learns to
+# stand, and goes on standing.
+CLIPPED_NORMAL = {
+    "distribution_type": "normal",
+    "noise_std_type": "log",
+    "init_noise_std": 1.0,
+    "mean_kernel_init_fn": lambda: jax.nn.initializers.variance_scaling(0.01, "fan_in", "uniform"),
+}
+TRAININGS = {
+    "allegro_hand": Training(
+        make_env=allegro_hand.make_env,
+        success_floor=math.inf,  # goals count, returns do not
+        measure=("goals_per_step", lambda state: state.success.astype(jnp.float32)),
+        hidden_sizes=(256, 256),
+        network=CLIPPED_NORMAL | {"init_noise_std": 0.6},
+        view=allegro_hand.view,
+        step_size=0.3,
+        episode_length=allegro_hand.HORIZON,
+        stages=(
+            Stage(TURNING, turning, options={"tolerance": 0.4}),
+            Stage(TURNING, turning, options={"tolerance": 0.2}, begins=16_000_000),
+            Stage(TURNING, turning, begins=32_000_000),
+        ),
+    ),
+    "anymal": Training(
+        make_env=functools.partial(anymal.make_env, success_return=math.inf),
+        success_floor=anymal.SUCCESS_FLOOR,
+        measure=("mean_tracking_error", anymal.tracking_error),
+        vary=change_command,
+        network=CLIPPED_NORMAL,
+        episode_length=1000,
+        # The first 6 million steps ran with two iterations of the solver, the rest with the model's ten.
+        stages=(
+            Stage(LARGE_BATCHES | {"discounting": 0.98, "reward_scaling": 3.0}, progress),
+            Stage(LARGE_BATCHES | FINE, calm_walking, begins=10_000_000, noise=0.3),
+            Stage(LARGE_BATCHES | FINE | SMALL_STEPS, sure_walking, begins=18_000_000, noise=0.12),
+            Stage(LARGE_BATCHES | FINE | {"desired_kl": 0.01}, sure_walking, begins=25_000_000, noise=0.2),
+            Stage(LARGE_BATCHES | FINE | SMALL_STEPS, sure_walking, begins=32_000_000, noise=0.1),
+        ),
+    ),
+    "humanoid": Training(
+        make_env=functools.partial(humanoid.make_env, success_return=math.inf),
+        success_floor=humanoid.SUCCESS_FLOOR,
+        measure=("mean_forward_speed", humanoid.forward_speed),
+        episode_length=humanoid.HORIZON,
+        stages=(Stage({"clipping_epsilon": 0.3, "entropy_cost": 1e-3, "discounting": 0.97, "reward_scaling": 0.1}),),
+    ),
+}

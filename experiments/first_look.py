@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 import fleetjax
-from fleetjax.io import figure, folder, text
+from fleetjax.io import figure, files, folder, text
 
 ALGORITHMS = ("constraint", "random", "ensemble_dagger", "thrifty_dagger", "cur", "expert")
 COLUMNS = {"successes": "successes", "violations": "violations", "idle": "idle", "human_steps": "human time"}
@@ -62,7 +62,7 @@ def main() -> None:
         print("| " + " | ".join(row) + " |")
     picture = args.output / "first_look.png"
     shown = [entry for entry in data if entry[0].algorithm != "expert"]  # its curves would flatten the others
-    folder.write(picture, figure.render(figure.draw(figure.group(shown))))
+    files.write(picture, figure.render(figure.draw(figure.group(shown))))
     print(f"\n{picture}")
 
 

@@ -8,8 +8,9 @@ import contextlib
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -17,7 +18,7 @@ import numpy as np
 from fleetjax import envs
 from fleetjax.config import FIELDS, Config, make_config, validate
 from fleetjax.envs import get_defaults, list_envs
-from fleetjax.io import execution, flags, folder, text
+from fleetjax.io import execution, files, flags, folder, operation, text
 from fleetjax.io.flags import Refusal
 from fleetjax.io.progress import progress, say
 from fleetjax.metrics import Metrics
@@ -40,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments = flags.parse(sys.argv[1:] if argv is None else argv)
         commands[arguments.command](arguments)
     except (Refusal, OSError) as error:
-        say(f"fleetjax: {_one_line(error)}")
+        say(f"fleetjax: {files.one_line(error)}")
         return 2
     except KeyboardInterrupt as interrupt:
         say(" ".join(["fleetjax: interrupted", *interrupt.args]))
@@ -49,12 +50,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             os._exit(INTERRUPTED)
         return INTERRUPTED
     return 0
-
-
-def _one_line(error: BaseException) -> str:
-    if isinstance(error, OSError) and error.strerror:
-        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-    return " ".join(str(error).split())
 
 
 @contextlib.contextmanager
@@ -68,57 +63,96 @@ def _refusing() -> Iterator[None]:
 
 def _run(arguments: argparse.Namespace) -> None:
     overrides = {name: value for name, value in vars(arguments).items() if name in FIELDS}
-    seed = arguments.seed
     with _refusing():
-        config = make_config(overrides.pop("environment"), overrides.pop("algorithm", "cur"), **overrides)
-    path = arguments.output or folder.default_folder(config, seed)
-    folder.create(path, config, seed, overwrite=arguments.overwrite)
+        if arguments.checkpoint_every < 0 or arguments.checkpoint_every == 1:
+            raise ValueError(f"checkpoint_every = {arguments.checkpoint_every} must be 0 (none) or at least 2 timesteps")
+        if arguments.resume:
+            path, config, seed = _to_resume(arguments, overrides)
+        else:
+            path, config, seed = _to_begin(arguments, overrides)
+            folder.check_free(path, overwrite=arguments.overwrite)
+            path.mkdir(parents=True, exist_ok=True)
+    with files.lock(path):
+        _run_in(path, config, seed, resume=bool(arguments.resume), checkpoint_every=arguments.checkpoint_every)
+
+
+def _to_begin(arguments: argparse.Namespace, given: Mapping[str, Any]) -> tuple[Path, Config, int]:
+    """Return folder, configuration and seed of a new run.
+
+    Raises:
+        ValueError: if they cannot be used.
+    """
+    if "environment" not in given:
+        raise ValueError(f"ENV is missing; choose one of {', '.join(list_envs())}, or go on with a run by --resume RUN")
+    overrides = {name: value for name, value in given.items() if name not in ("environment", "algorithm")}
+    config, seed = make_config(given["environment"], given.get("algorithm", "cur"), **overrides), arguments.seed or 0
+    return arguments.output or folder.default_folder(config, seed), config, seed
+
+
+def _to_resume(arguments: argparse.Namespace, given: Mapping[str, Any]) -> tuple[Path, Config, int]:
+    """Return folder, configuration and seed of the run to go on with.
+
+    Raises:
+        ValueError: if there is none, or other parameters were given than it has.
+    """
+    if arguments.output or arguments.overwrite:
+        raise ValueError("--resume goes on in the run's own folder; leave out --output and --overwrite")
+    run = folder.read_run(arguments.resume)
+    has = folder.to_plain(run.config) | {"seed": run.seed}
+    asked = folder.to_plain(run.config.replace(**given)) | {"seed": run.seed if arguments.seed is None else arguments.seed}
+    for name, value in asked.items():
+        if value != has[name]:
+            raise ValueError(f"{name} = {value} is not the run's, which is {has[name]}; leave it out, or begin another run")
+    return run.folder, run.config, run.seed
+
+
+def _run_in(path: Path, config: Config, seed: int, *, resume: bool, checkpoint_every: int) -> None:
+    """Run in a folder that is locked."""
     begun = time.monotonic()
-    chunks: list[Metrics] = []
-    try:
-        state = _operate(config, seed, chunks)
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(_keep(path, config, seed, chunks)) from None
-    metrics = execution.join(chunks)
-    if get_algorithm(config.algorithm).pretrains:
-        folder.write_policy(path, state.learner)
-    _save(path, config, seed, metrics)
+    with _refusing():
+        run = folder.read_run(path) if resume else None
+        metrics = folder.read_metrics(run) if run and folder.is_finished(run) else None
+    if metrics:
+        say(f"{path} is finished; there is nothing to go on with")
+    else:
+        if resume:
+            folder.write_config(path, config, seed, sealed=False)
+        else:
+            folder.create(path, config, seed)
+        with _refusing():
+            metrics = _operate(path, config, seed, resume=resume, checkpoint_every=checkpoint_every)
     print(f"\n{text.headline(config, seed)}\n\n{text.run_table(metrics, config)}\n")
     print(f"{text.duration(time.monotonic() - begun)} in all. Run folder: {path}")
 
 
-def _operate(config: Config, seed: int, chunks: list[Metrics]):
-    """Pre-train and run, with progress; the metrics go to `chunks` as they come. Return the last state."""
-    begun, key = time.monotonic(), jax.random.key(seed)
-    first = "pre-training" if get_algorithm(config.algorithm).pretrains else "preparing"
-    say(f"{text.headline(config, seed)}, on the {jax.default_backend().upper()}: compiling and {first} ...")
-    state = execution.start(config, key)
-    say(f"ready after {text.duration(time.monotonic() - begun)}")
-    with progress(config) as show:
-        for metrics, after in execution.go_on(config, key, state, execution.chunks_of(config.num_steps)):
-            chunks.append(metrics)
-            show(metrics)
-            state = after
-    return state
-
-
-def _keep(path: Path, config: Config, seed: int, chunks: list[Metrics]) -> str:
-    """Save what an interrupted run has; return what there is to say about it."""
-    if not chunks:
-        folder.discard(path)
-        return "before the first timestep; nothing was kept"
-    metrics = execution.join(chunks)
+def _operate(path: Path, config: Config, seed: int, *, resume: bool, checkpoint_every: int) -> Metrics:
+    """Run what is left, and write what it gave."""
+    try:
+        metrics, state = operation.operate(path, config, seed, resume=resume, checkpoint_every=checkpoint_every)
+    except KeyboardInterrupt:
+        _keep(path, config, seed)
+        raise
+    if get_algorithm(config.algorithm).pretrains:
+        folder.write_policy(path, state.learner)
     _save(path, config, seed, metrics)
-    return f"after {len(metrics.successes)} of {config.num_steps} timesteps; their metrics and figure are in {path}"
+    return metrics
+
+
+def _keep(path: Path, config: Config, seed: int) -> None:
+    """Draw what an interrupted run has; remove its folder if that is nothing."""
+    if not (path / folder.METRICS).exists():
+        folder.discard(path)
+        raise KeyboardInterrupt("before the first timestep; nothing was kept") from None
+    metrics = folder.parse_metrics((path / folder.METRICS).read_bytes(), config.num_steps)
+    _save(path, config, seed, metrics)
 
 
 def _save(path: Path, config: Config, seed: int, metrics: Metrics) -> None:
     from fleetjax.io import figure  # matplotlib takes a while to import
 
-    folder.write_metrics(path, metrics)
     drawn = figure.draw(figure.group([(config, seed, metrics)]), text.headline(config, seed))
-    folder.write(path / folder.FIGURE, figure.render(drawn))
-    folder.write_config(path, config, seed)
+    files.write(path / folder.FIGURE, figure.render(drawn))
+    folder.write_config(path, config, seed, sealed=True)
 
 
 def _list(arguments: argparse.Namespace) -> None:
@@ -155,7 +189,7 @@ def _plot(arguments: argparse.Namespace) -> None:
     if left_out:
         say(f"{text.plural(left_out, 'run')} left out: same settings and seed as a later one")
     drawn = figure.draw(groups)
-    folder.write(arguments.output, figure.render(drawn, arguments.output.suffix))
+    files.write(arguments.output, figure.render(drawn, arguments.output.suffix))
     print(arguments.output)
 
 
@@ -180,7 +214,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     metrics = execution.join(chunks)
     total = {name: np.sum(getattr(metrics, name)).item() for name in _EVALUATED}
     content = {"num_steps": config.num_steps, "seed": seed, "totals": total, "versions": folder.versions()}
-    folder.write_json(output, content)
+    files.write_json(output, content)
     print(text.evaluation_table(metrics, config))
 
 
@@ -214,7 +248,7 @@ def _render(arguments: argparse.Namespace) -> None:
     pictures = render.draw(film, scene, width=arguments.width, height=3 * arguments.width // 4, every=arguments.every)
     rate = 1 / (envs.make(config.environment, config.backend).spec.control_step * arguments.every)
     with _refusing():
-        folder.write(arguments.output, render.encode(pictures, arguments.output, rate=rate))
+        files.write(arguments.output, render.encode(pictures, arguments.output, rate=rate))
     print(arguments.output)
 
 

@@ -8,9 +8,18 @@ from fleetjax import cli
 from fleetjax.io import folder
 from fleetjax.metrics import Metrics
 
+STEPS = 120  # chunks of two
+TINY = [
+    *("--num-robots", "4", "--num-humans", "2", "--num-steps", str(STEPS), "--hard-reset-time", "2", "--initial-period", "9"),
+    *("--hidden-sizes", "8", "--ensemble-size", "2", "--batch-size", "8", "--critic-capacity", "300"),
+    *("--num-demonstrations", "20", "--pretraining-steps", "5"),
+    *("--num-critic-transitions", "20", "--critic-pretraining-steps", "5"),
+]
+
 
 def contents(path: Path) -> dict[str, bytes]:
-    return {file.name: file.read_bytes() for file in path.iterdir()}
+    """Return the files of a folder by name; those of its folders are left out."""
+    return {file.name: file.read_bytes() for file in path.iterdir() if file.is_file()}
 
 
 def refused(capsys, *arguments: object) -> str:

@@ -4,7 +4,7 @@ import pytest
 from commands import contents, refused
 
 from fleetjax.config import Config
-from fleetjax.io import folder
+from fleetjax.io import files
 
 RUN = ("run", "navigation")
 BAD_RUNS = {
@@ -24,7 +24,7 @@ BAD_RUNS = {
     "flag with =": ((*RUN, "--hard-reset=4"), "unknown flag --hard-reset; the closest is --hard-reset-time"),
     "too much": ((*RUN, "humanoid"), "unexpected argument 'humanoid'"),
     "no value": ((*RUN, "--num-robots"), "--num-robots: expected one argument"),
-    "no environment": (("run",), "required: ENV"),
+    "no environment": (("run",), "ENV is missing"),
     "no goal": (("run", "humanoid", "--algorithm", "thrifty_dagger"), "algorithm = 'thrifty_dagger' needs a goal"),
     "negative uncertainty": ((*RUN, "--uncertainty-threshold", -0.1), "uncertainty_threshold = -0.1"),
     "negative risk": ((*RUN, "--risk-threshold", "-.5"), "risk_threshold = -0.5 must be in [0, 1]"),
@@ -75,5 +75,5 @@ def test_integers_beyond_32_bits_are_refused():
 
 
 def test_a_disk_that_fails_costs_one_line(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(folder.os, "fsync", lambda descriptor: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    monkeypatch.setattr(files.os, "fsync", lambda descriptor: (_ for _ in ()).throw(OSError(28, "No space left on device")))
     assert refused(capsys, *RUN, "--output", tmp_path / "run") == "fleetjax: No space left on device\n"

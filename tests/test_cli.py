@@ -1,6 +1,5 @@
 """The command line: what it prints and writes, and that its chunks change nothing."""
 
-import contextlib
 import json
 import shutil
 import signal
@@ -12,19 +11,11 @@ import jax
 import numpy as np
 import pandas as pd
 import pytest
-from commands import contents, refused
+from commands import STEPS, TINY, contents, refused
 
 import fleetjax
 from fleetjax import cli
 from fleetjax.io import folder
-
-STEPS = 120  # chunks of two
-TINY = [
-    *("--num-robots", "4", "--num-humans", "2", "--num-steps", str(STEPS), "--hard-reset-time", "2", "--initial-period", "9"),
-    *("--hidden-sizes", "8", "--ensemble-size", "2", "--batch-size", "8", "--critic-capacity", "300"),
-    *("--num-demonstrations", "20", "--pretraining-steps", "5"),
-    *("--num-critic-transitions", "20", "--critic-pretraining-steps", "5"),
-]
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +63,7 @@ def test_the_same_seed_gives_the_same_files_and_a_table(finished, copied, capsys
         assert f"\n{name} " in printed.out
     assert ["human", "time", str(metrics.human_steps.sum())] in [line.split()[:3] for line in printed.out.splitlines()]
     assert str(copied) in printed.out
-    assert "compiling and pre-training" in printed.err.splitlines()[0]
+    assert "compiling and pre-training" in printed.err.splitlines()[1]
     assert printed.err.splitlines()[-1].startswith("100% ")
     for name in ("metrics.csv", "policy.msgpack", "figure.png"):
         assert (copied / name).read_bytes() == (finished / name).read_bytes()
@@ -95,42 +86,13 @@ def test_default_folders_are_made_below_runs_and_never_used_again(finished, tmp_
     assert "mean of 2 seeds" in Path("all.svg").read_text()
 
 
-def stop_after(chunks: int):
-    """Return progress that is interrupted in the given chunk."""
-
-    @contextlib.contextmanager
-    def progress(config):
-        shown = iter(range(chunks - 1))
-
-        def show(metrics):
-            if next(shown, None) is None:
-                raise KeyboardInterrupt
-
-        yield show
-
-    return progress
-
-
-def test_an_interrupted_run_keeps_its_metrics(finished, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(cli, "progress", stop_after(5))
-    path = tmp_path / "stopped"
-    assert cli.main(["run", "navigation", *TINY, "--seed", "3", "--output", str(path)]) == 130
-    line = capsys.readouterr().err.splitlines()[-1]
-    assert line == f"fleetjax: interrupted after 10 of 120 timesteps; their metrics and figure are in {path}"
-    assert set(contents(path)) == {"config.json", "metrics.csv", "figure.png"}
-    kept, whole = ((p / "metrics.csv").read_text().splitlines() for p in (path, finished))
-    assert kept == whole[:11]
-    assert "policy.msgpack is missing" in refused(capsys, "evaluate", path)
-    assert cli.main(["plot", str(path), "--output", str(tmp_path / "figure.pdf")]) == 0
-    assert "was interrupted; the curves of its kind end at 10 timesteps" in capsys.readouterr().err
-
-
 def test_ctrl_c_before_the_first_timestep_leaves_nothing(tmp_path):
     listen = "signal.signal(signal.SIGINT, signal.default_int_handler)"  # a background shell's children ignore it
     program = f"import signal, sys; {listen}; from fleetjax.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", program, "run", "navigation", "--output", str(tmp_path / "new" / "run")]
     process = subprocess.Popen(command, text=True, stderr=subprocess.PIPE, stdout=subprocess.PIPE)
     assert process.stderr is not None
+    assert "C.U.R. on navigation" in process.stderr.readline()
     assert "compiling and pre-training" in process.stderr.readline()
     process.send_signal(signal.SIGINT)
     out, err = process.communicate()
@@ -183,7 +145,8 @@ def test_damaged_runs_and_impossible_evaluations_are_refused(copied, capsys, tmp
     assert "SHA-256" in refused(capsys, "evaluate", copied)
     assert "evaluation.json" not in contents(copied)
     config = fleetjax.make_config("navigation", "expert", num_robots=2)
-    folder.create(tmp_path / "expert", config, 0, overwrite=False)
+    (tmp_path / "expert").mkdir()
+    folder.create(tmp_path / "expert", config, 0)
     assert "trains no policy" in refused(capsys, "evaluate", tmp_path / "expert")
     (copied / "config.json").write_text("{}")
     for command in ("plot", "evaluate"):
@@ -233,8 +196,9 @@ def test_list_shows_environments_and_algorithms(capsys):
 
 def test_parameters_arrive_as_they_are_typed(monkeypatch, tmp_path):
     made = []
-    monkeypatch.setattr(cli.folder, "create", lambda path, config, seed, overwrite: made.append((config, seed)))
-    monkeypatch.setattr(cli, "_operate", lambda *arguments: (_ for _ in ()).throw(OSError("stop here")))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cli.folder, "create", lambda path, config, seed: made.append((config, seed)))
+    monkeypatch.setattr(cli, "_operate", lambda *arguments, **options: (_ for _ in ()).throw(OSError("stop here")))
     flags = ["--hidden-sizes", "16", "8", "--no-normalize-observations", "--num-steps", "1e3", "--risk-threshold", ".25"]
     fleet = ["--algorithm", "expert", "--num-robots", "7", "--backend", "native"]
     assert cli.main(["run", "navigation", *fleet, "--seed", "4294967295", *flags]) == 2

@@ -1,5 +1,6 @@
 """Run folders, figures, tables and progress: what is written comes back, and what is damaged is refused."""
 
+import contextlib
 import functools
 import json
 from pathlib import Path
@@ -14,7 +15,7 @@ from commands import make_metrics
 from hypothesis import strategies
 
 import fleetjax
-from fleetjax.io import execution, folder
+from fleetjax.io import execution, files, folder
 from fleetjax.learning.imitation import make_learner
 from fleetjax.learning.networks import Normalizer
 from fleetjax.metrics import Metrics
@@ -41,10 +42,12 @@ def make_tiny_config():
 def saved(tmp_path, config):
     """A finished run folder."""
     path = tmp_path / "a run"
-    folder.create(path, config, 5, overwrite=False)
+    path.mkdir()
+    folder.create(path, config, 5)
     folder.write_policy(path, make_policy())
-    folder.write_metrics(path, make_metrics())
-    folder.write_config(path, config, 5)
+    with contextlib.closing(folder.open_metrics(path)) as log:
+        folder.append_metrics(log, make_metrics(), 0)
+    folder.write_config(path, config, 5, sealed=True)
     return path
 
 
@@ -80,10 +83,10 @@ def test_the_configuration_is_plain_json_with_seed_and_versions(saved):
 
 def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
     path = tmp_path / "file"
-    folder.write(path, b"old")
-    monkeypatch.setattr(folder.os, "fsync", lambda descriptor: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    files.write(path, b"old")
+    monkeypatch.setattr(files.os, "fsync", lambda descriptor: (_ for _ in ()).throw(OSError(28, "No space left on device")))
     with pytest.raises(OSError, match="No space left"):
-        folder.write(path, b"new")
+        files.write(path, b"new")
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -152,7 +155,7 @@ def test_damaged_and_foreign_folders_are_refused_with_the_reason(saved, name):
 def test_metrics_that_make_no_sense_are_refused_even_where_the_digest_fits(saved, config, old, new, reason):
     path = saved / "metrics.csv"
     path.write_text(path.read_text().replace(old, new))
-    folder.write_config(saved, config, 5)
+    folder.write_config(saved, config, 5, sealed=True)
     with pytest.raises(ValueError, match=reason):
         folder.read_metrics(folder.read_run(saved))
 
@@ -160,7 +163,7 @@ def test_metrics_that_make_no_sense_are_refused_even_where_the_digest_fits(saved
 def test_a_policy_that_is_not_finite_is_refused(saved, config):
     policy = make_policy()
     folder.write_policy(saved, policy._replace(normalizer=policy.normalizer._replace(mean=jnp.full(8, jnp.nan))))
-    folder.write_config(saved, config, 5)
+    folder.write_config(saved, config, 5, sealed=True)
     with pytest.raises(ValueError, match="not finite"):
         folder.read_policy(folder.read_run(saved))
 
@@ -170,28 +173,32 @@ def test_default_folders_are_new(tmp_path, monkeypatch, config):
     monkeypatch.setattr(folder.time, "strftime", lambda form: "20300102-030405")
     first = folder.default_folder(config, 3)
     assert str(first) == "runs/navigation-cur-seed3-20300102-030405"
-    folder.create(first, config, 3, overwrite=False)
+    first.mkdir(parents=True)
     assert folder.default_folder(config, 3).name == f"{first.name}-2"
 
 
 def test_overwriting_spares_what_fleetjax_did_not_write(saved, config):
     (saved / "notes.txt").write_text("mine")
     with pytest.raises(FileExistsError, match="--overwrite"):
-        folder.create(saved, config, 6, overwrite=False)
-    assert folder.read_run(saved).seed == 5
-    folder.create(saved, config, 6, overwrite=True)
+        folder.check_free(saved, overwrite=False)
+    folder.check_free(saved, overwrite=True)
+    folder.create(saved, config, 6)
     assert {path.name for path in saved.iterdir()} == {"config.json", "notes.txt"}
     assert folder.read_run(saved).seed == 6
 
 
-@hypothesis.given(strategies.integers(1, 200_000))
-def test_chunks_add_up_and_need_at_most_two_programs(num_steps):
-    lengths = execution.chunks_of(num_steps)
+@hypothesis.given(strategies.integers(1, 200_000), strategies.integers(2, 5_000) | strategies.none())
+def test_chunks_add_up_and_need_at_most_two_programs(num_steps, within):
+    """And none is a single timestep, which would be a program with other roundings."""
+    length = execution.chunk_length(num_steps, within)
+    lengths = execution.chunks_of(num_steps, length)
     assert sum(lengths) == num_steps
     assert len(set(lengths)) <= 2
-    assert len(lengths) <= 3 * execution.CHUNKS + 1
+    assert 1 not in lengths or num_steps == 1
+    assert within or len(lengths) <= 3 * execution.CHUNKS + 1
+    assert max(lengths) <= max(3, within or num_steps, 3 * num_steps // execution.CHUNKS) + 3
 
 
 def test_a_paper_scale_run_is_a_hundred_equal_chunks():
-    assert execution.chunks_of(10_000) == [100] * 100
-    assert execution.chunks_of(2_000) == [20] * 100
+    assert execution.chunks_of(10_000, execution.chunk_length(10_000, 1000)) == [100] * 100
+    assert execution.chunks_of(2_000, execution.chunk_length(2_000, 1000)) == [20] * 100

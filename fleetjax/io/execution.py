@@ -15,33 +15,42 @@ from fleetjax.run import evaluate, prepare, run
 CHUNKS = 100  # that a run is divided into, more or less
 
 
-def chunk_length(num_steps: int) -> int:
-    """Return into how many timesteps to divide a run: near a hundredth, and without a remainder if that can be.
+def chunk_length(num_steps: int, within: int | None = None) -> int:
+    """Return into how many timesteps to divide a run: near a hundredth, a divisor of `within` if there is one near.
 
-    A remainder would be compiled anew.
+    A chunk of one timestep would be another program, with other roundings.
 
-    >>> chunk_length(10_000), chunk_length(20), chunk_length(10_005), chunk_length(10_007)
-    (100, 1, 115, 101)
+    Args:
+        num_steps: timesteps of the run.
+        within: what chunks shall add up to without a remainder, which would be compiled anew; None = the run.
+
+    >>> chunk_length(10_000), chunk_length(20), chunk_length(10_005), chunk_length(10_007), chunk_length(10_000, 250)
+    (100, 2, 115, 101, 125)
     """
-    wanted = -(-num_steps // CHUNKS)
-    near = [n for n in range(-(-wanted // 3), 3 * wanted + 1) if num_steps % n == 0]
-    return min(near, key=lambda n: abs(np.log(n / wanted)), default=wanted)
+    within = within or num_steps
+    wanted = max(2, -(-num_steps // CHUNKS))
+    near = [n for n in range(max(2, -(-wanted // 3)), 3 * wanted + 1) if within % n == 0]
+    return min(near, key=lambda n: abs(np.log(n / wanted)), default=min(wanted, within))
 
 
-def chunks_of(num_steps: int) -> list[int]:
-    """Return the lengths of a run's chunks, in order."""
-    length = chunk_length(num_steps)
-    rest = num_steps % length
-    return [length] * (num_steps // length) + [rest] * (rest > 0)
+def chunks_of(num_steps: int, length: int) -> list[int]:
+    """Return the lengths of chunks that add up to `num_steps`, in order; none is 1 unless all are.
+
+    >>> chunks_of(10, 4), chunks_of(9, 4), chunks_of(1, 4), chunks_of(0, 4)
+    ([4, 4, 2], [4, 5], [1], [])
+    """
+    full, rest = divmod(num_steps, length)
+    chunks = [length] * full + [rest] * (rest > 0)
+    return [*chunks[:-2], chunks[-2] + 1] if rest == 1 and full else chunks
 
 
-def start(config: Config, key: jax.Array) -> FleetState:
-    """Pre-train, and compile the first chunk meanwhile. Keyboard interrupts come through at once.
+def start(config: Config, key: jax.Array, length: int) -> FleetState:
+    """Pre-train, and compile the first chunk of `length` timesteps meanwhile. Keyboard interrupts come through at once.
 
     Returns:
         FleetState: the state at t = 0; `go_on` from it finds its program compiled.
     """
-    first = config.replace(num_steps=chunk_length(config.num_steps))
+    first = config.replace(num_steps=length)
     pool = ThreadPoolExecutor(2)  # this thread only waits: an interrupt within JAX's own code could get lost
     try:
         lowered = pool.submit(lambda: jax.jit(prepare).lower(config, key)).result()
@@ -53,6 +62,11 @@ def start(config: Config, key: jax.Array) -> FleetState:
 
 
 _advance = jax.jit(run, donate_argnums=2)  # the state's memory is used again: buffers can be large
+
+
+def shapes(config: Config, key: jax.Array) -> FleetState:
+    """Return shapes and types of a fleet's state; nothing is computed."""
+    return jax.eval_shape(prepare, config, key)
 
 
 def go_on(config: Config, key: jax.Array, state: FleetState, lengths: list[int]) -> Iterator[tuple[Metrics, FleetState]]:
@@ -78,7 +92,7 @@ def start_evaluation(config: Config, key: jax.Array, learner: LearnerState) -> I
     Returns:
         Iterator of Metrics[C] in numpy arrays; together they are those of `evaluate(config, key, learner)`.
     """
-    length, *others = chunks_of(config.num_steps)
+    length, *others = chunks_of(config.num_steps, chunk_length(config.num_steps))
     first = config.replace(num_steps=length)
     begin = jax.jit(evaluate).lower(first, key, learner).compile()
     config = config.replace(algorithm="constraint")  # nobody teleoperates

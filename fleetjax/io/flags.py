@@ -121,12 +121,22 @@ def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser
 
 
 def _add_run(commands: Any, environment: str | None) -> None:
-    usage = "fleetjax run ENV [--seed N] [--output DIR] [--overwrite] [parameters]"
+    usage = "fleetjax run ENV [--seed N] [--output DIR] [--overwrite] [--checkpoint-every N] [parameters]\n"
+    usage += "       fleetjax run --resume RUN"
     run = commands.add_parser("run", help="run a fleet", usage=usage, description=_RUN_ABOUT, epilog=_RUN_NOTE)
-    run.add_argument("environment", metavar="ENV", help=f"environment: {', '.join(list_envs())}")
-    run.add_argument("--seed", metavar="N", type=_seed, default=0, help="random seed [default: 0]")
+    environments = f"environment: {', '.join(list_envs())}"
+    run.add_argument("environment", metavar="ENV", nargs="?", default=argparse.SUPPRESS, help=environments)
+    run.add_argument("--resume", metavar="RUN", type=Path, help="go on with a run that was stopped, from its last checkpoint")
+    run.add_argument("--seed", metavar="N", type=_seed, help="random seed [default: 0]")
     run.add_argument("--output", metavar="DIR", type=Path, help="run folder [default: a new one below runs/]")
     run.add_argument("--overwrite", action="store_true", help="replace the run in an existing folder")
+    run.add_argument(
+        "--checkpoint-every",
+        metavar="N",
+        type=_integer,
+        default=1000,
+        help="timesteps between checkpoints, of which the last two are kept; 0 = none [default: 1000]",
+    )
     parameters = run.add_argument_group(f"parameters{f' (defaults of {environment})' if environment else ''}")
     for name, field in FIELDS.items():
         if name != "environment":

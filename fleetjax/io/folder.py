@@ -6,13 +6,12 @@ are refused if they do not match. Nothing is executed when it is read.
 
 import contextlib
 import csv
-import hashlib
 import io
 import itertools
 import json
 import math
-import os
 import re
+import shutil
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -25,13 +24,16 @@ from flax import serialization
 
 from fleetjax import envs
 from fleetjax.config import FIELDS, Config, validate
+from fleetjax.io import checkpoint, files
 from fleetjax.learning.imitation import LearnerState, make_learner
 from fleetjax.learning.networks import Normalizer
 from fleetjax.metrics import Metrics
+from fleetjax.priority import get_algorithm
 from fleetjax.version import VERSION
 
 CONFIG, METRICS, FIGURE, POLICY, EVALUATION = "config.json", "metrics.csv", "figure.png", "policy.msgpack", "evaluation.json"
 REALS = ("reward", "uncertainty", "policy_loss")  # the metrics that are no counts
+_COLUMNS = ("timestep", *Metrics._fields)
 _LARGEST = 2**31 - 1  # traced integers are i32
 
 
@@ -70,42 +72,20 @@ def check_free(path: Path, *, overwrite: bool) -> None:
     raise FileExistsError(f"{path} exists already; choose another --output, or pass --overwrite")
 
 
-def create(path: Path, config: Config, seed: int, *, overwrite: bool) -> None:
-    """Make a run folder with its configuration; an older run in it goes.
-
-    Raises:
-        OSError: if it cannot be made, or exists.
-    """
-    check_free(path, overwrite=overwrite)
-    path.mkdir(parents=True, exist_ok=True)
+def create(path: Path, config: Config, seed: int) -> None:
+    """Write the configuration of a new run; an older run in the folder goes."""
     for name in (CONFIG, METRICS, FIGURE, POLICY, EVALUATION):
         (path / name).unlink(missing_ok=True)
-    write_config(path, config, seed)
+    shutil.rmtree(path / checkpoint.FOLDER, ignore_errors=True)
+    write_config(path, config, seed, sealed=False)
 
 
 def discard(path: Path) -> None:
     """Remove a run folder in which nothing but a configuration was written."""
-    (path / CONFIG).unlink(missing_ok=True)
+    for name in (CONFIG, files.LOCK):
+        (path / name).unlink(missing_ok=True)
     with contextlib.suppress(OSError):  # it holds files of others
         path.rmdir()
-
-
-def write(path: Path, data: bytes) -> None:
-    """Write a file under a temporary name and rename it, so that it is never seen half-written."""
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        with partial.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
-
-
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a JSON file."""
-    write(path, (json.dumps(content, indent=2) + "\n").encode())
 
 
 def versions() -> dict[str, str]:
@@ -115,16 +95,12 @@ def versions() -> dict[str, str]:
     return {"fleetjax": VERSION, "jax": jax.__version__, "mujoco": mujoco.__version__}
 
 
-def write_config(folder: Path, config: Config, seed: int) -> None:
-    """Write `config.json`: every field, the seed, versions, and the SHA-256 of the data files that are there."""
+def write_config(folder: Path, config: Config, seed: int, *, sealed: bool) -> None:
+    """Write `config.json`: every field, the seed, versions, and the SHA-256 of the data files that are there, if `sealed`."""
     data = {name: folder / name for name in (METRICS, POLICY)}
-    digests = {name: _digest(path.read_bytes()) for name, path in data.items() if path.exists()}
-    content = {"config": to_plain(config), "seed": seed, "versions": versions(), "sha256": digests}
-    write_json(folder / CONFIG, content)
-
-
-def _digest(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()
+    digests = {name: files.digest(path.read_bytes()) for name, path in data.items() if sealed and path.exists()}
+    content = {**identity(config, seed), "versions": versions(), "sha256": digests}
+    files.write_json(folder / CONFIG, content)
 
 
 def to_plain(config: Config) -> dict[str, Any]:
@@ -139,19 +115,30 @@ def to_plain(config: Config) -> dict[str, Any]:
     return {name: plain(name, getattr(config, name)) for name in FIELDS}
 
 
-def write_metrics(folder: Path, metrics: Metrics) -> None:
-    """Write `metrics.csv`: a row a timestep, first column `timestep`."""
-    columns = [np.asarray(x) for x in metrics]
+def identity(config: Config, seed: int) -> dict[str, Any]:
+    """Return plain values that tell a run from others."""
+    return {"config": to_plain(config), "seed": seed}
+
+
+def open_metrics(folder: Path, mark: Mapping[str, Any] | None = None) -> files.Log:
+    """Begin `metrics.csv`, a row a timestep with first column `timestep`, or cut it back to a mark."""
+    log = files.Log(folder / METRICS, mark)
+    if not mark:
+        log.append((",".join(_COLUMNS) + "\n").encode())
+    return log
+
+
+def append_metrics(log: files.Log, metrics: Metrics, first: int) -> None:
+    """Append the rows of the timesteps from `first` on."""
     rows = io.StringIO(newline="")
-    writer = csv.writer(rows, lineterminator="\n")
-    writer.writerow(("timestep", *Metrics._fields))
-    writer.writerows((t, *row) for t, row in enumerate(zip(*columns, strict=True)))
-    write(folder / METRICS, rows.getvalue().encode())
+    columns = [np.asarray(x) for x in metrics]
+    csv.writer(rows, lineterminator="\n").writerows((t, *row) for t, row in enumerate(zip(*columns, strict=True), first))
+    log.append(rows.getvalue().encode())
 
 
 def write_policy(folder: Path, learner: LearnerState) -> None:
     """Write `policy.msgpack`: the ensemble's parameters [E, ...] and the normalizer, by flax's serialization."""
-    write(folder / POLICY, serialization.to_bytes(_policy(learner)))
+    files.write(folder / POLICY, serialization.to_bytes(_policy(learner)))
 
 
 def _policy(learner: LearnerState) -> dict[str, Any]:
@@ -190,6 +177,19 @@ def read_run(folder: Path) -> Run:
         return Run(folder, _from_plain(content["config"]), seed, digests)
 
 
+def is_finished(run: Run) -> bool:
+    """Return whether a run has all its timesteps, and the policy that it was to train.
+
+    Raises:
+        ValueError: if what it has is damaged.
+    """
+    if METRICS not in run.digests or len(read_metrics(run).successes) < run.config.num_steps:
+        return False
+    if get_algorithm(run.config.algorithm).pretrains:
+        read_policy(run)
+    return True
+
+
 def _from_plain(fields: Mapping[str, Any]) -> Config:
     for problem, names in (("unknown", set(fields) - set(FIELDS)), ("missing", set(FIELDS) - set(fields))):
         _expect(not names, f"{problem} fields: {', '.join(sorted(names))} (another version of fleetjax?)")
@@ -220,7 +220,7 @@ def _fits(value: Any, kind: type) -> bool:
 def _read_data(run: Run, name: str) -> bytes:
     """Return the content of a data file that is as it was written."""
     data = (run.folder / name).read_bytes()
-    _expect(run.digests.get(name) == _digest(data), "its SHA-256 is not that in config.json, so it is damaged")
+    _expect(run.digests.get(name) == files.digest(data), "its SHA-256 is not that in config.json, so it is damaged")
     return data
 
 
@@ -231,12 +231,21 @@ def read_metrics(run: Run) -> Metrics:
         ValueError: if the file is missing, damaged or not a run's.
     """
     with _blame(run.folder / METRICS):
-        head, *rows = csv.reader(io.StringIO(_read_data(run, METRICS).decode()))
-        _expect(head == ["timestep", *Metrics._fields], "its columns are not those of this version of fleetjax")
-        _expect(0 < len(rows) <= run.config.num_steps, f"{len(rows)} rows for {run.config.num_steps} timesteps")
-        _expect(all(row[:1] == [str(t)] for t, row in enumerate(rows)), "timesteps are missing")
-        columns = zip(Metrics._fields, list(zip(*rows, strict=True))[1:], strict=True)
-        return Metrics._make(np.array(x, np.float32 if name in REALS else np.int32) for name, x in columns)
+        return parse_metrics(_read_data(run, METRICS), run.config.num_steps)
+
+
+def parse_metrics(data: bytes, num_steps: int) -> Metrics:
+    """Return the Metrics[T] in the content of `metrics.csv`, as numpy arrays.
+
+    Raises:
+        ValueError: if it is not a run's of at most `num_steps` timesteps.
+    """
+    head, *rows = csv.reader(io.StringIO(data.decode()))
+    _expect(head == list(_COLUMNS), "its columns are not those of this version of fleetjax")
+    _expect(0 < len(rows) <= num_steps, f"{len(rows)} rows for {num_steps} timesteps")
+    _expect(all(row[:1] == [str(t)] for t, row in enumerate(rows)), "timesteps are missing")
+    columns = zip(Metrics._fields, list(zip(*rows, strict=True))[1:], strict=True)
+    return Metrics._make(np.array(x, np.float32 if name in REALS else np.int32) for name, x in columns)
 
 
 def read_policy(run: Run) -> LearnerState:

@@ -22,16 +22,18 @@ def say(message: str) -> None:
 
 
 @contextlib.contextmanager
-def progress(config: Config, *, with_rohe: bool = True) -> Iterator[Callable[[Metrics], None]]:
+def progress(config: Config, before: Metrics | None = None, *, with_rohe: bool = True) -> Iterator[Callable[[Metrics], None]]:
     """Yield a function that takes the Metrics[C] of each chunk of timesteps and shows how the run stands.
 
     A terminal gets a bar and a line that are redrawn, anything else a line every tenth of the run.
 
     Args:
         config: configuration of the run.
+        before: Metrics[t] of the timesteps that were run already.
         with_rohe: whether the return on human effort is among the counts.
     """
-    total = dict.fromkeys(Metrics._fields, 0.0)
+    done = len(before.successes) if before else 0
+    total = dict.fromkeys(Metrics._fields, 0.0) | (text.add_up(before) if before else {})
 
     def counts(chunk: Metrics) -> str:
         total.update({name: total[name] + more for name, more in text.add_up(chunk).items()})
@@ -40,12 +42,12 @@ def progress(config: Config, *, with_rohe: bool = True) -> Iterator[Callable[[Me
         return ", ".join(parts + [f"ROHE {text.rohe_of(total, config):.3f}"] * with_rohe)
 
     if not _is_screen():
-        yield _log(config.num_steps, counts)
+        yield _log(config.num_steps, done, counts)
         return
     form = "{percentage:3.0f}% |{bar}| {rate_noinv_fmt}, {remaining} left"
     options: dict[str, Any] = {"dynamic_ncols": True, "file": sys.stderr}
     with (
-        tqdm(total=config.num_steps, unit=" steps", bar_format=form, **options) as bar,
+        tqdm(total=config.num_steps, initial=done, unit=" steps", bar_format=form, **options) as bar,
         tqdm(bar_format="  {desc}", position=1, **options) as line,
     ):
 
@@ -64,16 +66,16 @@ def _is_screen() -> bool:
         return False
 
 
-def _log(num_steps: int, counts: Callable[[Metrics], str]) -> Callable[[Metrics], None]:
+def _log(num_steps: int, first: int, counts: Callable[[Metrics], str]) -> Callable[[Metrics], None]:
     """Return a function that prints a line each time that another tenth of the timesteps is done."""
-    begun, done = time.monotonic(), 0
+    begun, done = time.monotonic(), first
 
     def write(chunk: Metrics) -> None:
         nonlocal done
         before, done = done, done + len(chunk.successes)
         shown = counts(chunk)
         if done * LINES // num_steps > before * LINES // num_steps:
-            rate = done / max(time.monotonic() - begun, 1e-9)
+            rate = (done - first) / max(time.monotonic() - begun, 1e-9)
             left = text.duration((num_steps - done) / rate)
             say(f"{100 * done // num_steps:3}% {rate:.1f} steps/s, {left} left, {shown}")
 

@@ -1,0 +1,214 @@
+"""Checkpoints of a running fleet: orbax stores the arrays, and a manifest with their SHA-256 is written last and checked first.
+
+A checkpoint is a folder named by its timestep. Without a manifest it is unfinished and never read; with one whose digests do
+not match it is damaged, and an older one is taken. orbax itself restores flipped bits without a word.
+"""
+
+import contextlib
+import hashlib
+import json
+import logging
+import shutil
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fleetjax.fleet import FleetState
+from fleetjax.io import files
+
+FOLDER, ARRAYS, MANIFEST = "checkpoints", "arrays", "manifest.json"
+KEPT = 2
+
+
+class Checkpoint(NamedTuple):
+    """A checkpoint that was read.
+
+    Attributes:
+        path: where it is.
+        state: the fleet.
+        notes: what was noted down with it.
+    """
+
+    path: Path
+    state: FleetState
+    notes: Mapping[str, Any]
+
+
+class Writer:
+    """Writes checkpoints behind a running fleet, one at a time, and keeps the last two.
+
+    Args:
+        folder: folder of the run.
+        identity: plain values that tell this run from others.
+    """
+
+    def __init__(self, folder: Path, identity: Mapping[str, Any]):
+        self.folder, self.identity = folder / FOLDER, identity
+        self._worker = ThreadPoolExecutor(1)
+        self._pending: Future[None] | None = None
+
+    def write(self, state: FleetState, notes: Mapping[str, Any]) -> None:
+        """Copy the state, and write it in the background once the one before is finished.
+
+        Raises:
+            OSError: if the one before could not be written.
+        """
+        self.wait()
+        arrays = _named(state, lambda x: np.array(jax.device_get(_plain(x))))
+        self._pending = self._worker.submit(self._store, int(state.timestep), arrays, dict(notes))
+
+    def wait(self) -> None:
+        """Wait until nothing is being written.
+
+        Raises:
+            OSError: if it could not be written; those before are as they were.
+        """
+        pending, self._pending = self._pending, None
+        if pending:
+            pending.result()
+
+    def _store(self, timestep: int, arrays: dict[str, np.ndarray], notes: dict[str, Any]) -> None:
+        path = self.folder / f"{timestep:010}"
+        try:
+            shutil.rmtree(path, ignore_errors=True)
+            path.mkdir(parents=True)
+            _checkpointer(lambda orbax: orbax.save((path / ARRAYS).absolute(), arrays))
+            manifest = {"timestep": timestep, **self.identity, "notes": notes, "sha256": _digests(path)}
+            files.write_json(path / MANIFEST, manifest)
+        except Exception as error:  # orbax passes on what its storage raises, of any kind
+            shutil.rmtree(path, ignore_errors=True)
+            raise OSError(f"the checkpoint at t = {timestep} could not be written ({files.one_line(error)})") from error
+        for old in sorted(self.folder.iterdir())[:-KEPT]:
+            shutil.rmtree(old)
+
+
+def restore(
+    folder: Path, identity: Mapping[str, Any], shapes: FleetState, check: Callable[[Mapping[str, Any]], Any]
+) -> tuple[Checkpoint | None, list[str]]:
+    """Read the newest checkpoint of a run that is whole.
+
+    Args:
+        folder: folder of the run.
+        identity: the run's.
+        shapes: the structure of its state, by `jax.eval_shape`.
+        check: raises ValueError for notes that do not fit the run's other files.
+
+    Returns:
+        The checkpoint, None if there is none, and for each newer one why it cannot be used.
+    """
+    refused = []
+    for path in sorted((folder / FOLDER).glob("[0-9]*"), reverse=True):
+        try:
+            checkpoint = _read(path, identity, shapes)
+            check(checkpoint.notes)
+            return checkpoint, refused
+        except (ValueError, TypeError, KeyError, OSError) as error:
+            refused.append(f"{path}: {files.one_line(error)}")
+    return None, refused
+
+
+def _read(path: Path, identity: Mapping[str, Any], shapes: FleetState) -> Checkpoint:
+    """Read a checkpoint.
+
+    Raises:
+        ValueError: if it is unfinished, damaged or another run's.
+    """
+    if not (path / MANIFEST).exists():
+        raise ValueError("it was never finished")
+    manifest = json.loads((path / MANIFEST).read_bytes())
+    if not isinstance(manifest, dict) or not isinstance(manifest.get("notes"), dict):
+        raise ValueError(f"{MANIFEST} is not fleetjax's")
+    if any(manifest.get(name) != value for name, value in identity.items()):
+        raise ValueError("it is another run's")
+    if manifest.get("sha256") != _digests(path):
+        raise ValueError("its SHA-256 are not those of its manifest, so it is damaged")
+    wanted = _named(shapes, lambda x: np.zeros(*_layout(x)))
+    found = _checkpointer(lambda orbax: orbax.restore((path / ARRAYS).absolute(), wanted))
+    names, leaves = zip(*jax.tree_util.tree_leaves_with_path(shapes), strict=True)
+    arrays = [_restored(found, jax.tree_util.keystr(name), leaf) for name, leaf in zip(names, leaves, strict=True)]
+    state: FleetState = jax.tree.unflatten(jax.tree.structure(shapes), arrays)
+    if int(state.timestep) != manifest.get("timestep"):
+        raise ValueError("its timestep is not that of its manifest")
+    return Checkpoint(path, state, manifest["notes"])
+
+
+def _checkpointer(use: Callable[[Any], Any]) -> Any:
+    """Return what `use` makes of an orbax checkpointer, when it is done writing."""
+    import orbax.checkpoint as ocp  # imported on demand: it takes seconds
+
+    with _without_traces(), ocp.StandardCheckpointer() as orbax:
+        result = use(orbax)
+        orbax.wait_until_finished()
+    return result
+
+
+@contextlib.contextmanager
+def _without_traces() -> Iterator[None]:
+    """Keep traces off stderr that orbax and tensorstore print from threads of their own, besides raising the error."""
+    absl, usual = logging.getLogger("absl"), sys.unraisablehook
+    level = absl.level
+
+    def hook(unraisable: Any) -> None:
+        if str(unraisable.exc_value) != "Event loop is closed":  # of a write that failed; it may come late
+            usual(unraisable)
+
+    absl.setLevel(logging.CRITICAL)
+    sys.unraisablehook = hook
+    yield
+    absl.setLevel(level)  # not after a failure, whose traces are still to come
+    sys.unraisablehook = usual
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _plain(leaf: jax.Array) -> jax.Array:
+    """Return a leaf as an array of numbers: those of a random key."""
+    return jax.random.key_data(leaf) if _is_key(leaf) else leaf
+
+
+def _layout(leaf: Any) -> tuple[tuple[int, ...], Any]:
+    """Return shape and type of a leaf as it is stored."""
+    plain = jax.eval_shape(_plain, leaf)
+    return plain.shape, plain.dtype
+
+
+def _named(state: FleetState, value: Callable[[Any], np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the value of each leaf by its name; orbax does not take empty arrays, so they are left out."""
+    leaves = jax.tree_util.tree_leaves_with_path(state)
+    return {jax.tree_util.keystr(name): value(leaf) for name, leaf in leaves if leaf.size}
+
+
+def _restored(found: Mapping[str, np.ndarray], name: str, leaf: Any) -> jax.Array:
+    """Return the array for a leaf.
+
+    Raises:
+        ValueError: if it does not fit.
+    """
+    shape, dtype = _layout(leaf)
+    array = found[name] if leaf.size else np.zeros(shape, dtype)
+    if (array.shape, array.dtype) != (shape, dtype):
+        raise ValueError(f"{name} is {array.dtype}{list(array.shape)}, and {dtype}{list(shape)} is wanted")
+    restored = jnp.array(array)  # a copy, whose memory a run may take over
+    restored = jax.random.wrap_key_data(restored) if _is_key(leaf) else restored
+    if restored.dtype != leaf.dtype:
+        raise ValueError(f"{name} is {restored.dtype}, and {leaf.dtype} is wanted")
+    return restored
+
+
+def _digests(path: Path) -> dict[str, str]:
+    """Return the SHA-256 of every file below a checkpoint's folder but the manifest, by relative name."""
+    found = sorted(file for file in path.rglob("*") if file.is_file() and file != path / MANIFEST)
+    return {file.relative_to(path).as_posix(): _digest(file) for file in found}
+
+
+def _digest(file: Path) -> str:
+    with file.open("rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest()

@@ -1,0 +1,131 @@
+"""Files that survive: written whole or not at all, appended to and cut back, locked."""
+
+import contextlib
+import fcntl
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+LOCK = ".lock"
+
+
+def write(path: Path, data: bytes) -> None:
+    """Write a file under a temporary name and rename it, so that it is never seen half-written."""
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        with partial.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a JSON file."""
+    write(path, (json.dumps(content, indent=2) + "\n").encode())
+
+
+def digest(data: bytes) -> str:
+    """Return the SHA-256 in hexadecimal."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def one_line(error: BaseException) -> str:
+    """Return the message of an error without line breaks, with the file that an OSError names."""
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+@contextlib.contextmanager
+def lock(folder: Path) -> Iterator[None]:
+    """Keep other processes out of a folder, until the block ends or the process does, however it ends.
+
+    Raises:
+        BlockingIOError: if another process has it.
+    """
+    path = folder / LOCK
+    with contextlib.ExitStack() as held:
+        while True:
+            file = held.enter_context(path.open("a+"))
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                file.seek(0)
+                raise BlockingIOError(f"{folder} is in use by process {file.read().strip() or 'of unknown number'}") from None
+            if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                break  # and not a file that its last owner has removed meanwhile
+        file.truncate(0)
+        file.write(f"{os.getpid()}\n")
+        file.flush()
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
+
+
+class Log:
+    """A file that rows are appended to.
+
+    Args:
+        path: the file.
+        mark: what `mark` returned when the file was as it shall be again; None begins a new file.
+
+    Raises:
+        ValueError: if the file did not begin as it did then.
+    """
+
+    def __init__(self, path: Path, mark: Mapping[str, Any] | None = None):
+        self.path = path
+        self._digest = hashlib.sha256()
+        if mark:
+            self._digest.update(beginning(path, mark))
+            self._file = path.open("r+b")
+            self._file.truncate(mark["size"])
+            self._file.seek(mark["size"])
+        else:
+            self._file = path.open("wb")
+
+    def append(self, data: bytes) -> None:
+        """Add bytes; they are with the operating system when this returns.
+
+        Raises:
+            OSError: if it does not take them; the error names the file.
+        """
+        try:
+            self._file.write(data)
+            self._file.flush()
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self.path)) from None
+        self._digest.update(data)
+
+    def mark(self) -> dict[str, Any]:
+        """Put what was appended on the disk; return what `Log` needs to cut the file back to this."""
+        os.fsync(self._file.fileno())
+        return {"size": self._file.tell(), "sha256": self._digest.hexdigest()}
+
+    def close(self) -> None:
+        """Close the file; what it did not take before is lost."""
+        with contextlib.suppress(OSError):
+            self._file.close()
+
+
+def beginning(path: Path, mark: Mapping[str, Any]) -> bytes:
+    """Return what a file held when it was marked.
+
+    Raises:
+        ValueError: if it does not hold it any more.
+    """
+    size, wanted = mark.get("size"), mark.get("sha256")
+    if not path.is_file() or not isinstance(size, int):
+        raise ValueError(f"{path.name} is missing")
+    with path.open("rb") as file:
+        data = file.read(size)
+    if digest(data) != wanted:
+        raise ValueError(f"{path.name} is not as it was at that time")
+    return data

@@ -1,0 +1,355 @@
+"""A run that is stopped, killed or damaged and gone on with gives the bits of one that was not."""
+
+import contextlib
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from commands import STEPS, TINY, contents, refused
+
+import fleetjax
+from fleetjax import cli
+from fleetjax.io import checkpoint, files, folder, operation
+
+RUN = ("run", "navigation", *TINY, "--seed", "3")
+RESULTS = ("metrics.csv", "policy.msgpack")
+
+
+def run_here(*arguments: object) -> int:
+    return cli.main([str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The folder of a run that nobody disturbed."""
+    path = tmp_path_factory.mktemp("runs") / "whole"
+    assert run_here(*RUN, "--output", path) == 0
+    return path
+
+
+def assert_same(path: Path, whole: Path) -> None:
+    for name in RESULTS:
+        assert (path / name).read_bytes() == (whole / name).read_bytes(), name
+
+
+def interrupt_after(chunks: int, *, times: int = 1):
+    """Return progress that presses Ctrl-C at the end of a chunk."""
+
+    @contextlib.contextmanager
+    def progress(config, before=None):
+        shown = iter(range(chunks - 1))
+
+        def show(metrics):
+            if next(shown, None) is None:
+                for _ in range(times):
+                    signal.raise_signal(signal.SIGINT)
+
+        yield show
+
+    return progress
+
+
+@pytest.fixture
+def stopped(tmp_path, monkeypatch, whole, capsys):
+    """A run with checkpoints at t = 30, 60 and 66, where Ctrl-C stopped it; the last two are kept."""
+    path = tmp_path / "stopped"
+    with monkeypatch.context() as patch:
+        patch.setattr(operation, "progress", interrupt_after(33))
+        assert run_here(*RUN, "--output", path, "--checkpoint-every", 30) == 130
+    assert steps_of(path) == [60, 66]
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line == f"fleetjax: interrupted at t = 66 of {STEPS}; go on with: fleetjax run --resume {path}"
+    return path
+
+
+def steps_of(path: Path) -> list[int]:
+    return sorted(int(found.name) for found in (path / checkpoint.FOLDER).iterdir())
+
+
+def test_an_undisturbed_run_is_the_librarys_bit_for_bit(whole):
+    run = folder.read_run(whole)
+    expected = jax.jit(fleetjax.run)(run.config, jax.random.key(3))
+    jax.tree.map(np.testing.assert_array_equal, folder.read_metrics(run), jax.device_get(expected.metrics))
+    jax.tree.map(np.testing.assert_array_equal, folder.read_policy(run).params, expected.state.learner.params)
+    assert np.sum(expected.metrics.hard_resets) > 0
+
+
+def test_ctrl_c_writes_a_checkpoint_from_which_the_run_goes_on(stopped, whole, capsys):
+    assert set(contents(stopped)) == {"config.json", "metrics.csv", "figure.png"}
+    assert (stopped / "metrics.csv").read_text().splitlines() == (whole / "metrics.csv").read_text().splitlines()[:67]
+    assert "policy.msgpack is missing" in refused(capsys, "evaluate", stopped)
+    assert run_here("plot", stopped, "--output", stopped / "figure.pdf") == 0
+    assert "was interrupted; the curves of its kind end at 66 timesteps" in capsys.readouterr().err
+    assert run_here("run", "--resume", stopped) == 0
+    assert f"going on from {stopped / 'checkpoints' / '0000000066'}" in capsys.readouterr().err
+    assert_same(stopped, whole)
+    before = contents(stopped)
+    assert run_here("run", "--resume", stopped) == 0
+    assert "is finished; there is nothing to go on with" in capsys.readouterr().err
+    assert contents(stopped) == before
+
+
+def test_a_second_ctrl_c_stops_at_once_and_the_run_goes_on_from_an_older_checkpoint(tmp_path, monkeypatch, whole, capsys):
+    path = tmp_path / "stopped"
+    with monkeypatch.context() as patch:
+        patch.setattr(operation, "progress", interrupt_after(20, times=2))
+        assert run_here(*RUN, "--output", path, "--checkpoint-every", 30) == 130
+    assert "interrupted at once, without a checkpoint" in capsys.readouterr().err
+    assert steps_of(path) == [30]
+    assert run_here("run", "--resume", path, "--checkpoint-every", 0) == 0
+    assert steps_of(path) == [30]
+    assert_same(path, whole)
+
+
+@pytest.mark.parametrize("every", [7, 45, 119])
+def test_any_chunk_length_and_any_stop_give_the_same_bits(tmp_path, monkeypatch, whole, every):
+    path = tmp_path / "stopped"
+    with monkeypatch.context() as patch:
+        patch.setattr(operation, "progress", interrupt_after(1))
+        assert run_here(*RUN, "--output", path, "--checkpoint-every", every) == 130
+        assert run_here("run", "--resume", path, "--checkpoint-every", 5) == 130
+    assert run_here("run", "navigation", "--resume", path, "--num-steps", STEPS, "--seed", 3) == 0
+    assert_same(path, whole)
+
+
+def test_metrics_behind_the_checkpoint_are_cut_off(stopped, whole):
+    shutil.rmtree(stopped / checkpoint.FOLDER / "0000000066")
+    folder.write_config(stopped, folder.read_run(stopped).config, 3, sealed=False)  # as a kill leaves it
+    with (stopped / "metrics.csv").open("a") as file:
+        file.write("66,1,2")  # a row that a kill has cut
+    assert run_here("run", "--resume", stopped) == 0
+    assert_same(stopped, whole)
+
+
+def newest(path: Path) -> Path:
+    return max((path / checkpoint.FOLDER).iterdir())
+
+
+def largest(path: Path) -> Path:
+    return max((file for file in path.rglob("*") if file.is_file()), key=lambda file: file.stat().st_size)
+
+
+def truncate(path: Path) -> None:
+    os.truncate(largest(path), largest(path).stat().st_size // 2)
+
+
+def flip(path: Path) -> None:
+    data = bytearray(largest(path).read_bytes())
+    data[len(data) // 3] ^= 8
+    largest(path).write_bytes(data)
+
+
+def edit(path: Path, **fields) -> None:
+    manifest = json.loads((path / checkpoint.MANIFEST).read_text())
+    (path / checkpoint.MANIFEST).write_text(json.dumps(manifest | fields))
+
+
+DAMAGES = {
+    "truncated": (truncate, "damaged"),
+    "bit flipped": (flip, "damaged"),
+    "another run's": (lambda path: edit(path, seed=4), "it is another run's"),
+    "another version's": (lambda path: edit(path, config={"num_robots": 4}), "it is another run's"),
+    "unfinished": (lambda path: (path / checkpoint.MANIFEST).unlink(), "it was never finished"),
+    "manifest cut": (lambda path: os.truncate(path / checkpoint.MANIFEST, 100), "0000000066: "),
+    "not fleetjax's": (lambda path: (path / checkpoint.MANIFEST).write_text("[]"), "is not fleetjax's"),
+    "other metrics": (lambda path: edit(path, notes={"metrics": {"size": 9, "sha256": ""}}), "metrics.csv is not as it was"),
+    "a file more": (lambda path: (path / "stray").write_text("?"), "damaged"),
+    "emptied": (lambda path: shutil.rmtree(path / checkpoint.ARRAYS), "damaged"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_a_checkpoint_that_cannot_be_used_is_named_and_the_older_one_taken(stopped, whole, capsys, name):
+    damage, reason = DAMAGES[name]
+    damage(newest(stopped))
+    assert run_here("run", "--resume", stopped) == 0
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith(("left out", "going on"))]
+    assert said[0].startswith(f"left out {stopped / 'checkpoints' / '0000000066'}: ")
+    assert reason in said[0]
+    assert said[1] == f"going on from {stopped / 'checkpoints' / '0000000060'}"
+    assert_same(stopped, whole)
+
+
+def test_without_a_whole_checkpoint_nothing_is_touched(stopped, capsys):
+    for path in (stopped / checkpoint.FOLDER).iterdir():
+        flip(path)
+    metrics = (stopped / "metrics.csv").read_bytes()
+    assert run_here("run", "--resume", stopped) == 2
+    assert "has no checkpoint that could be used" in capsys.readouterr().err.splitlines()[-1]
+    assert (stopped / "metrics.csv").read_bytes() == metrics
+    assert steps_of(stopped) == [60, 66]
+
+
+def test_arrays_of_other_shapes_are_refused(stopped, whole):
+    """Even where all digests fit: a checkpoint that orbax could restore, of another fleet."""
+    config = folder.read_run(stopped).config
+    key, identity = jax.random.key(3), folder.identity(config, 3)
+    shapes = operation.execution.shapes(config.replace(num_robots=5), key)
+    found, refused = checkpoint.restore(stopped, identity, shapes, lambda notes: None)
+    assert found is None
+    assert len(refused) == 2
+    found, refused = checkpoint.restore(stopped, identity, operation.execution.shapes(config, key), lambda notes: None)
+    assert found is not None
+    assert not refused
+    assert int(found.state.timestep) == 66
+
+
+def test_random_keys_and_empty_arrays_survive(tmp_path):
+    state = {"keys": jax.random.split(jax.random.key(5), 3), "none": np.zeros((3, 0), np.float32), "timestep": np.int32(8)}
+
+    class State(dict):
+        timestep = state["timestep"]
+
+    jax.tree_util.register_pytree_node(
+        State, lambda s: (tuple(s.values()), tuple(s)), lambda names, values: State(zip(names, values, strict=True))
+    )
+    writer = checkpoint.Writer(tmp_path, {"seed": 1})
+    writer.write(State(state), {})  # pyright: ignore[reportArgumentType]
+    writer.wait()
+    shapes = jax.eval_shape(lambda: State(jax.tree.map(jax.numpy.asarray, state)))
+    found, refused = checkpoint.restore(tmp_path, {"seed": 1}, shapes, lambda notes: None)  # pyright: ignore[reportArgumentType]
+    assert not refused
+    assert found is not None
+    assert jax.random.key_data(found.state["keys"]).tolist() == jax.random.key_data(state["keys"]).tolist()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["--seed", "4"], "seed = 4 is not the run's, which is 3"),
+        (["--num-robots", "5"], "num_robots = 5 is not the run's, which is 4"),
+        (["--algorithm", "cu"], "algorithm = cu is not the run's"),
+        (["--overwrite"], "leave out --output and --overwrite"),
+        (["--checkpoint-every", "1"], "checkpoint_every = 1 must be 0 (none) or at least 2"),
+        (["--checkpoint-every", "-3"], "checkpoint_every = -3 must be"),
+    ],
+)
+def test_flags_that_contradict_the_run_are_refused(whole, capsys, arguments, reason):
+    before = contents(whole)
+    assert reason in refused(capsys, "run", "--resume", whole, *arguments)
+    assert contents(whole) == before
+
+
+def test_what_is_no_run_or_of_a_newer_version_is_refused(stopped, capsys, tmp_path):
+    assert "is not a run folder: there is none" in refused(capsys, "run", "--resume", tmp_path / "nowhere")
+    assert "ENV is missing" in refused(capsys, "run")
+    content = json.loads((stopped / "config.json").read_text())
+    content["config"]["flux"] = 1
+    (stopped / "config.json").write_text(json.dumps(content))
+    assert "unknown fields: flux (another version of fleetjax?)" in refused(capsys, "run", "--resume", stopped)
+
+
+def test_a_folder_in_use_is_refused(stopped, whole, capsys):
+    with files.lock(stopped):
+        for arguments in (("run", "--resume", stopped), (*RUN, "--output", stopped, "--overwrite")):
+            assert f"{stopped} is in use by process {os.getpid()}" in refused(capsys, *arguments)
+    assert steps_of(stopped) == [60, 66]
+    assert run_here("run", "--resume", stopped) == 0
+    assert not (stopped / files.LOCK).exists()
+    assert_same(stopped, whole)
+
+
+# Other processes, which can be killed
+
+
+@pytest.fixture(scope="module")
+def spawn(tmp_path_factory):
+    """A function that starts the command line in a process; compiled programs are kept, so that starts are quick."""
+    cache = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path_factory.mktemp("programs"))}
+    cache |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0", "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "0"}
+
+    def spawn(*arguments: object, largest_file: int = resource.RLIM_INFINITY) -> subprocess.Popen[str]:
+        limit = f"import resource, runpy; resource.setrlimit(resource.RLIMIT_FSIZE, ({largest_file},) * 2)"
+        command = [sys.executable, "-c", f"{limit}; runpy.run_module('fleetjax', run_name='__main__')", *map(str, arguments)]
+        return subprocess.Popen(command, env=os.environ | cache, text=True, stderr=subprocess.PIPE)
+
+    return spawn
+
+
+def wait_for(condition, process) -> bool:
+    """Wait until a condition holds; return whether it did before the process ended."""
+    while process.poll() is None:
+        if condition():
+            return True
+        time.sleep(5e-4)
+    return False
+
+
+def rows(path: Path) -> int:
+    return (path / "metrics.csv").read_bytes().count(b"\n") - 1 if (path / "metrics.csv").exists() else 0
+
+
+def test_kills_at_random_moments_lose_no_bit(tmp_path, whole, spawn):
+    path, rng = tmp_path / "killed", np.random.default_rng(0)
+    arguments, resumed = (*RUN, "--output", path, "--checkpoint-every", 10), 0
+    for wanted in (int(rng.integers(1, 40)), 55, 90):
+        process = spawn(*arguments)
+        with contextlib.ExitStack() as stack:
+            stack.callback(process.kill)
+            if wait_for(lambda wanted=wanted: rows(path) >= wanted, process):
+                time.sleep(rng.uniform(0, 0.02))
+                process.kill()
+            _, said = process.communicate()
+        resumed += "going on from" in said
+        arguments = ("run", "--resume", path, "--checkpoint-every", 10)
+    process = spawn(*arguments)
+    _, said = process.communicate()
+    assert process.returncode == 0, said
+    assert resumed + ("going on from" in said) >= 2
+    assert_same(path, whole)
+
+
+def test_a_kill_during_a_checkpoint_leaves_the_older_ones(stopped, whole, spawn, capsys):
+    before = steps_of(stopped)
+
+    def half_written() -> bool:
+        return any(not (found / checkpoint.MANIFEST).exists() for found in (stopped / checkpoint.FOLDER).iterdir())
+
+    for _ in range(5):
+        process = spawn("run", "--resume", stopped, "--checkpoint-every", 6)
+        if wait_for(half_written, process):
+            process.kill()
+        process.communicate()
+        if half_written():
+            break
+    assert half_written()
+    assert before[0] in steps_of(stopped) or len(steps_of(stopped)) >= 2
+    assert run_here("run", "--resume", stopped) == 0
+    said = capsys.readouterr().err
+    assert "it was never finished" in said
+    assert "going on from" in said
+    assert_same(stopped, whole)
+
+
+def test_a_full_disk_during_a_checkpoint_is_told_and_the_older_ones_stay(stopped, whole, spawn):
+    size = largest(newest(stopped)).stat().st_size
+    assert size // 2 > (whole / "metrics.csv").stat().st_size  # else the metrics would fail first
+    process = spawn("run", "--resume", stopped, "--checkpoint-every", 6, largest_file=size // 2)
+    _, said = process.communicate()
+    assert process.returncode == 2
+    assert "fleetjax: the checkpoint at t = 72 could not be written" in said.splitlines()[-1]
+    assert "Traceback" not in said
+    assert steps_of(stopped) == [60, 66]
+    assert run_here("run", "--resume", stopped) == 0
+    assert_same(stopped, whole)
+
+
+def test_a_full_disk_during_the_run_is_told_and_the_run_goes_on_later(stopped, whole, spawn):
+    size = (stopped / "metrics.csv").stat().st_size + 100
+    process = spawn("run", "--resume", stopped, "--checkpoint-every", 0, largest_file=size)
+    _, said = process.communicate()
+    assert process.returncode == 2
+    assert "File too large" in said.splitlines()[-1]
+    assert str(stopped) in said.splitlines()[-1]
+    assert "Traceback" not in said
+    assert run_here("run", "--resume", stopped) == 0
+    assert_same(stopped, whole)

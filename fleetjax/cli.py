@@ -34,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: arguments; None takes the process's, which Ctrl-C then ends at once.
 
     Returns:
-        int: exit code: 0, 2 for input that cannot be used, 130 after Ctrl-C.
+        int: exit code: 0, 1 for a run that diverged, 2 for input that cannot be used, 130 after Ctrl-C.
     """
     commands = {"run": _run, "list": _list, "plot": _plot, "evaluate": _evaluate, "render": _render}
     try:
@@ -43,6 +43,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (Refusal, OSError) as error:
         say(f"fleetjax: {files.one_line(error)}")
         return 2
+    except operation.Diverged as error:
+        say(f"fleetjax: {error}")
+        return 1
     except KeyboardInterrupt as interrupt:
         say(" ".join(["fleetjax: interrupted", *interrupt.args]))
         if argv is None:  # a computation that still runs would hold the process until it ends
@@ -129,7 +132,7 @@ def _operate(path: Path, config: Config, seed: int, *, resume: bool, checkpoint_
     """Run what is left, and write what it gave."""
     try:
         metrics, state = operation.operate(path, config, seed, resume=resume, checkpoint_every=checkpoint_every)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, operation.Diverged):
         _keep(path, config, seed)
         raise
     if get_algorithm(config.algorithm).pretrains:

@@ -19,6 +19,8 @@ from fleetjax.learning import critic, imitation
 from fleetjax.metrics import Metrics
 from fleetjax.types import EnvState, HumanState, Signals
 
+CRITICS = ("safety", "goal")  # in the order of `metrics.LEARNT`
+
 
 class FleetState(NamedTuple):
     """All that the next timestep needs.
@@ -95,7 +97,8 @@ def make_fleet(config: Config, env: Env) -> Fleet:
         action, uncertainty = learner.predict(state.learner, obs)
         chance = {kind: c.value(state.critics[kind], state.learner.normalizer, obs, action) for kind, c in critics.items()}
         never = jnp.zeros(num_robots)
-        risk, goal = chance.get("safety", never), chance.get("goal", never)
+        signals = (uncertainty, chance.get("safety", never), chance.get("goal", never))
+        uncertainty, risk, goal = (jnp.where(jnp.isfinite(x), x, 0.0) for x in signals)  # one robot must not spoil the ranks
         return Signals(state.env.violation, uncertainty, risk, goal, state.timestep), action
 
     def plan(state: FleetState, key: jax.Array, available: jax.Array | None = None) -> tuple[FleetState, Plan]:
@@ -121,13 +124,15 @@ def make_fleet(config: Config, env: Env) -> Fleet:
 
         keys = jax.random.split(key_env, num_robots)
         stepped = tree.where(moving, jax.vmap(env.step)(state.env, action, moving, keys), state.env)
+        sound = tree.finite((obs, action, stepped.obs, stepped.reward))
+        stepped = _contain(stepped, sound)
         humans = plan.humans._replace(duration=jnp.where(plan.humans.robot >= 0, plan.humans.duration + 1, 0))
 
         human_data, critic_states = state.human_data, state.critics
         if algorithm.updates:
-            human_data = imitation.append(human_data, imitation.Pair(obs, human_action), given, key_data)
+            human_data = imitation.append(human_data, imitation.Pair(obs, human_action), given & sound, key_data)
         steps = critic.Transition(obs, action, stepped.obs, stepped.violation, stepped.success)
-        critic_states = {kind: c.append(critic_states[kind], steps, moving) for kind, c in critics.items()}
+        critic_states = {kind: c.append(critic_states[kind], steps, moving & sound) for kind, c in critics.items()}
 
         helper = helper_of(humans, num_robots)
         reset_done = plan.resetting & (humans.duration[helper] >= config.hard_reset_time)
@@ -142,7 +147,8 @@ def make_fleet(config: Config, env: Env) -> Fleet:
         if algorithm.updates:
             policy, critic_states, loss = learn(policy, human_data, critic_states, key_learn)
 
-        metrics = _measure(config, state, plan, stepped, moving, reset_done, loss)
+        diverged = _diverged(policy, critic_states, state.priority)
+        metrics = _measure(config, state, plan, stepped, moving, reset_done, diverged, loss)
         state = FleetState(state.timestep + 1, after, humans, plan.resetting, policy, human_data, critic_states, state.priority)
         return state, metrics
 
@@ -178,8 +184,35 @@ def _restart_clocks(
     return humans._replace(duration=jnp.where(changed | completed, 0, humans.duration))
 
 
+def _contain(env: EnvState, sound: jax.Array) -> EnvState:
+    """Return EnvState[N] in which robots that are not `sound` bool[N] are in violation, and show nothing that is not finite."""
+    obs, reward, episode_return = (jnp.where(jnp.isfinite(x), x, 0.0) for x in (env.obs, env.reward, env.episode_return))
+    return env._replace(
+        obs=obs,
+        reward=reward,
+        episode_return=episode_return,
+        violation=env.violation | ~sound,
+        success=env.success & sound,
+        timeout=env.timeout & sound,
+    )
+
+
+def _diverged(policy: imitation.LearnerState, critics: dict[str, critic.CriticState], memory: Any) -> jax.Array:
+    """Return i32[], the bits of what in `LEARNT` is not finite."""
+    learnt = [policy.params, *((critics[k].params, critics[k].target) if k in critics else () for k in CRITICS), memory]
+    flags = [~jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(part)])) for part in learnt]
+    return sum((flag.astype(jnp.int32) << bit for bit, flag in enumerate(flags)), jnp.int32(0))
+
+
 def _measure(
-    config: Config, state: FleetState, plan: Plan, stepped: EnvState, moving: jax.Array, reset_done: jax.Array, loss: jax.Array
+    config: Config,
+    state: FleetState,
+    plan: Plan,
+    stepped: EnvState,
+    moving: jax.Array,
+    reset_done: jax.Array,
+    diverged: jax.Array,
+    loss: jax.Array,
 ) -> Metrics:
     """Count what happened in a timestep that began in `state` and led to `stepped`, before resets."""
 
@@ -202,6 +235,7 @@ def _measure(
         moving=count(moving),
         choices=count(chosen),
         risk_choices=count(chosen & moving & certain & at_risk),
+        diverged=diverged,
         reward=jnp.sum(jnp.where(moving, stepped.reward, 0.0)),
         uncertainty=jnp.sum(jnp.where(moving, plan.signals.uncertainty, 0.0)) / jnp.maximum(count(moving), 1),
         policy_loss=loss,

@@ -4,8 +4,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from fleetjax.config import Config
+
+LEARNT = ("policy", "safety critic", "goal critic", "priority")  # what can diverge, in the order of its bits
 
 
 class Metrics(NamedTuple):
@@ -22,6 +25,7 @@ class Metrics(NamedTuple):
         moving: robots that acted.
         choices: robots newly given to a human.
         risk_choices: those of them that only their risk spoke for: no violation, uncertainty below its threshold.
+        diverged: what of `LEARNT` holds numbers that are not finite, the sum of 1, 2, 4 and 8 for each; see `first_divergence`.
         reward: f32 sum of rewards over moving robots.
         uncertainty: f32 mean over moving robots.
         policy_loss: f32 mean imitation loss of the timestep's gradient steps.
@@ -37,6 +41,7 @@ class Metrics(NamedTuple):
     moving: jax.Array
     choices: jax.Array
     risk_choices: jax.Array
+    diverged: jax.Array
     reward: jax.Array
     uncertainty: jax.Array
     policy_loss: jax.Array
@@ -58,3 +63,16 @@ def rohe(metrics: Metrics, config: Config, time_unit: float = 100) -> jax.Array:
     # f32 is exact up to 2^24, and beyond i32 there are fleets that count on.
     successes, human_steps = (jnp.cumsum(x, axis=-1, dtype=jnp.float32) for x in (metrics.successes, metrics.human_steps))
     return (config.num_humans / config.num_robots) * successes / (1.0 + human_steps / time_unit)
+
+
+def first_divergence(metrics: Metrics) -> tuple[int, tuple[str, ...]] | None:
+    """Return the first timestep after which something learnt was not finite, and what; None if all was always finite.
+
+    Args:
+        metrics: counts [T] of one run, as they come out of it.
+    """
+    diverged = np.asarray(metrics.diverged)
+    if not diverged.any():
+        return None
+    first = int(np.argmax(diverged != 0))
+    return first, tuple(name for bit, name in enumerate(LEARNT) if diverged[first] >> bit & 1)

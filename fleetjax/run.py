@@ -1,6 +1,7 @@
 """A whole experiment: pre-train, then one scan over the fleet's timesteps; and the evaluation of what was learnt."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -41,10 +42,23 @@ def prepare(config: Config, key: jax.Array, env: envs.Env | None = None) -> Flee
     """
     validate(config, env)
     env = env or envs.make(config.environment, config.backend)
+
+    def start(config: Config, key: jax.Array) -> FleetState:
+        key_pretrain, key_reset = jax.random.split(key)
+        policy, data, critics = pretrain(config, env, key_pretrain)
+        return _start(config, env, key_reset, policy, data, critics)
+
     key_prepare, _ = jax.random.split(key)
-    key_pretrain, key_reset = jax.random.split(key_prepare)
-    policy, data, critics = pretrain(config, env, key_pretrain)
-    return _start(config, env, key_reset, policy, data, critics)
+    return _one_by_one(start)(config, key_prepare)
+
+
+def _one_by_one(function: Callable[..., Any]) -> Callable[..., Any]:
+    """On a CPU, let `vmap` call a function on one run after the other.
+
+    Side by side, matrix products would be rounded differently, and a last bit decides who is helped. A run that has the
+    CPU's cores to itself is no slower. `vmap` of anything else, and runs on other devices, go side by side.
+    """
+    return jax.custom_batching.sequential_vmap(function) if jax.default_backend() == "cpu" else function
 
 
 def _start(config: Config, env: envs.Env, key: jax.Array, policy: LearnerState, data, critics) -> FleetState:
@@ -85,14 +99,18 @@ def run(config: Config, key: jax.Array, state: FleetState | None = None, env: en
     validate(config, env)
     env = env or envs.make(config.environment, config.backend)
     start = prepare(config, key, env) if state is None else state
-    fleet = make_fleet(config, env)
+
+    def operate(config: Config, key: jax.Array, start: FleetState) -> Result:
+        fleet = make_fleet(config, env)
+
+        def timestep(state: FleetState, _: None) -> tuple[FleetState, Metrics]:
+            return fleet.step(state, jax.random.fold_in(key, state.timestep))
+
+        last, metrics = jax.lax.scan(timestep, start, length=config.num_steps)
+        return Result(metrics, last)
+
     _, key_steps = jax.random.split(key)
-
-    def timestep(state: FleetState, _: None) -> tuple[FleetState, Metrics]:
-        return fleet.step(state, jax.random.fold_in(key_steps, state.timestep))
-
-    last, metrics = jax.lax.scan(timestep, start, length=config.num_steps)
-    return Result(metrics, last)
+    return _one_by_one(operate)(config, key_steps, start)
 
 
 def evaluate(config: Config, key: jax.Array, learner: LearnerState, env: envs.Env | None = None) -> Result:

@@ -1,4 +1,4 @@
-"""Two helpers for pytrees whose leaves share a leading axis."""
+"""Helpers for pytrees whose leaves share a leading axis."""
 
 from typing import TypeVar
 
@@ -26,3 +26,9 @@ def where(mask: jax.Array, new: Tree, old: Tree) -> Tree:
 def take(rows: Tree, index: jax.Array) -> Tree:
     """Return the rows at `index` i32[...] of a pytree of arrays [N, ...]."""
     return jax.tree.map(lambda x: x[index], rows)
+
+
+def finite(rows: object) -> jax.Array:
+    """Return bool[N], for each row of a pytree of real arrays [N, ...] whether all its numbers are finite."""
+    leaves = jax.tree.leaves(rows)
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x), axis=tuple(range(1, x.ndim))) for x in leaves]), axis=0)

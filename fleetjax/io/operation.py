@@ -18,8 +18,12 @@ from fleetjax.config import Config
 from fleetjax.fleet import FleetState
 from fleetjax.io import checkpoint, execution, files, folder, text
 from fleetjax.io.progress import progress, say
-from fleetjax.metrics import Metrics
+from fleetjax.metrics import Metrics, first_divergence
 from fleetjax.priority import get_algorithm
+
+
+class Diverged(ArithmeticError):
+    """Something learnt is not finite any more."""
 
 
 class Start(NamedTuple):
@@ -52,6 +56,7 @@ def operate(path: Path, config: Config, seed: int, *, resume: bool, checkpoint_e
     Raises:
         ValueError: if there are checkpoints and none can be used.
         OSError: if something cannot be written.
+        Diverged: if what is learnt is not finite any more.
         KeyboardInterrupt: if it was asked to stop; the message says how to go on.
     """
     begun, key, total = time.monotonic(), jax.random.key(seed), config.num_steps
@@ -70,6 +75,7 @@ def operate(path: Path, config: Config, seed: int, *, resume: bool, checkpoint_e
             chunks.append(metrics)
             done += len(metrics.successes)
             show(metrics)
+            _check(metrics, done, path)
             stop = asked_to_stop() and done < total
             if stop or (checkpoint_every and saved + checkpoint_every <= done < total):
                 writer.write(state, {"metrics": log.mark()})
@@ -79,6 +85,26 @@ def operate(path: Path, config: Config, seed: int, *, resume: bool, checkpoint_e
                 raise KeyboardInterrupt(f"at t = {done} of {total}; go on with: fleetjax run --resume {path}")
         writer.wait()
     return execution.join(chunks), state
+
+
+def _check(chunk: Metrics, done: int, path: Path) -> None:
+    """Check that all that was learnt is finite.
+
+    Args:
+        chunk: Metrics[C] of the last timesteps.
+        done: timesteps so far, those included.
+        path: the run's folder.
+
+    Raises:
+        Diverged: if it is not; the message says what was not, and when first.
+    """
+    found = first_divergence(chunk)
+    if found:
+        first, names = found
+        when = done - len(chunk.diverged) + first
+        raise Diverged(
+            f"not finite from t = {when} on: {', '.join(names)}; a smaller learning_rate may help. Metrics so far are in {path}"
+        )
 
 
 def _begin(path: Path, config: Config, key: jax.Array, length: int) -> Start:

@@ -4,10 +4,10 @@ from fleetjax import envs
 from fleetjax.allocation import allocate
 from fleetjax.config import Config, make_config, validate
 from fleetjax.envs import Env, EnvSpec, list_envs, register_env
-from fleetjax.fleet import Fleet, FleetState, Plan, make_fleet
-from fleetjax.metrics import Metrics, rohe
+from fleetjax.fleet import Fleet, FleetState, Interventions, Plan, make_fleet
+from fleetjax.metrics import Metrics, first_divergence, rohe
 from fleetjax.priority import Algorithm, Priority, list_algorithms, register_algorithm, register_priority
-from fleetjax.run import Result, evaluate, prepare, run
+from fleetjax.run import Result, evaluate, prepare, run, run_logged
 from fleetjax.supervisors import Supervisor, list_supervisors, register_supervisor
 from fleetjax.types import EnvState, HumanState, Signals
 from fleetjax.version import VERSION
@@ -22,6 +22,7 @@ __all__ = [
     "Fleet",
     "FleetState",
     "HumanState",
+    "Interventions",
     "Metrics",
     "Plan",
     "Priority",
@@ -31,6 +32,7 @@ __all__ = [
     "allocate",
     "envs",
     "evaluate",
+    "first_divergence",
     "list_algorithms",
     "list_envs",
     "list_supervisors",
@@ -43,5 +45,6 @@ __all__ = [
     "register_supervisor",
     "rohe",
     "run",
+    "run_logged",
     "validate",
 ]

@@ -66,6 +66,36 @@ class Plan(NamedTuple):
     resetting: jax.Array
 
 
+class Interventions(NamedTuple):
+    """Whom each human teleoperates at a timestep, and what came of it; [M], after a run [T, M].
+
+    Attributes:
+        robot: i32 index of the robot, -1 = the human teleoperates nobody, and the rest is of no meaning.
+        priority: f32 the robot's score.
+        step: i32 its control steps since its reset, before this one.
+        obs: f32[O] what the human and the robot's policy saw.
+        robot_action: f32[A] what the policy would have done.
+        human_action: f32[A] what was done.
+        next_obs: f32[O] after it, before any reset or new goal.
+        reward: f32 of that step.
+        violation: bool whether it led to a violation.
+        success: bool whether it completed the task.
+        timeout: bool whether it reached the horizon.
+    """
+
+    robot: jax.Array
+    priority: jax.Array
+    step: jax.Array
+    obs: jax.Array
+    robot_action: jax.Array
+    human_action: jax.Array
+    next_obs: jax.Array
+    reward: jax.Array
+    violation: jax.Array
+    success: jax.Array
+    timeout: jax.Array
+
+
 class Fleet(NamedTuple):
     """Pure functions of a fleet. Keys: one a timestep, `fold_in(key, t)`.
 
@@ -74,11 +104,13 @@ class Fleet(NamedTuple):
         advance: `(state, Plan, human_action f32[N, A], given bool[N], key) -> (state, Metrics)`. `given` marks robots whose
             supervisor really gave that action; on other robots the policy acts, and nothing is recorded.
         step: `(state, key) -> (state, Metrics)`, with the simulated supervisor.
+        logged_step: `(state, key) -> (state, (Metrics, Interventions[M]))`, the same and what the supervisor did.
     """
 
     plan: Callable[..., tuple[FleetState, Plan]]
     advance: Callable[..., tuple[FleetState, Metrics]]
     step: Callable[[FleetState, jax.Array], tuple[FleetState, Metrics]]
+    logged_step: Callable[[FleetState, jax.Array], tuple[FleetState, tuple[Metrics, Interventions]]]
 
 
 def make_fleet(config: Config, env: Env) -> Fleet:
@@ -115,6 +147,13 @@ def make_fleet(config: Config, env: Env) -> Fleet:
     def advance(
         state: FleetState, plan: Plan, human_action: jax.Array, given: jax.Array, key: jax.Array
     ) -> tuple[FleetState, Metrics]:
+        state, metrics, _ = act(state, plan, human_action, given, key)
+        return state, metrics
+
+    def act(
+        state: FleetState, plan: Plan, human_action: jax.Array, given: jax.Array, key: jax.Array
+    ) -> tuple[FleetState, Metrics, EnvState]:
+        """Do what `advance` does; return also the robots' states after their step, before resets and new goals."""
         chex.assert_shape(human_action, (num_robots, env.spec.action_size))
         key_env, key_reset, key_goal, key_data, key_learn = jax.random.split(key, 5)
         given = given & plan.teleoperated
@@ -150,7 +189,7 @@ def make_fleet(config: Config, env: Env) -> Fleet:
         diverged = _diverged(policy, critic_states, state.priority)
         metrics = _measure(config, state, plan, stepped, moving, reset_done, diverged, loss)
         state = FleetState(state.timestep + 1, after, humans, plan.resetting, policy, human_data, critic_states, state.priority)
-        return state, metrics
+        return state, metrics, stepped
 
     def learn(policy, human_data, critic_states, key):
         """Take the timestep's gradient steps, policy first."""
@@ -166,13 +205,30 @@ def make_fleet(config: Config, env: Env) -> Fleet:
         (policy, critic_states), losses = jax.lax.scan(gradient_step, (policy, critic_states), keys)
         return policy, critic_states, jnp.sum(losses) / max(config.gradient_steps, 1)
 
-    def step(state: FleetState, key: jax.Array) -> tuple[FleetState, Metrics]:
+    def logged_step(state: FleetState, key: jax.Array) -> tuple[FleetState, tuple[Metrics, Interventions]]:
         key_plan, key_human, key_advance = jax.random.split(key, 3)
         state, plan_ = plan(state, key_plan)
         human_action = jax.vmap(supervisor.act)(state.env, jax.random.split(key_human, num_robots))
-        return advance(state, plan_, human_action, plan_.teleoperated, key_advance)
+        after, metrics, stepped = act(state, plan_, human_action, plan_.teleoperated, key_advance)
+        return after, (metrics, _watch(state.env, plan_, human_action, stepped))
 
-    return Fleet(plan, advance, step)
+    def step(state: FleetState, key: jax.Array) -> tuple[FleetState, Metrics]:
+        after, (metrics, _) = logged_step(state, key)
+        return after, metrics
+
+    return Fleet(plan, advance, step, logged_step)
+
+
+def _watch(before: EnvState, plan: Plan, human_action: jax.Array, stepped: EnvState) -> Interventions:
+    """Return what each human did in a timestep that led the robots from `before` to `stepped`."""
+    robot = plan.humans.robot
+    actions = (plan.robot_action, human_action)
+    outcome = (stepped.obs, stepped.reward, stepped.violation, stepped.success, stepped.timeout)
+    score, step, obs, (planned, done), result = tree.take(
+        (plan.score, before.episode_step, before.obs, actions, outcome), jnp.maximum(robot, 0)
+    )
+    robot = jnp.where((robot >= 0) & plan.teleoperated[robot], robot, -1)
+    return Interventions(robot, score, step, obs, planned, done, *result)
 
 
 def _restart_clocks(

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from fleetjax import envs, priority
 from fleetjax.config import Config, validate
-from fleetjax.fleet import FleetState, make_fleet
+from fleetjax.fleet import Fleet, FleetState, Interventions, make_fleet
 from fleetjax.learning.imitation import LearnerState, create_data
 from fleetjax.learning.pretraining import pretrain
 from fleetjax.metrics import Metrics
@@ -96,18 +96,47 @@ def run(config: Config, key: jax.Array, state: FleetState | None = None, env: en
 
     Reference: paper, Sections 3 and 4.
     """
+    metrics, last = _run(config, key, state, env, lambda fleet: fleet.step)
+    return Result(metrics, last)
+
+
+def run_logged(
+    config: Config, key: jax.Array, state: FleetState | None = None, env: envs.Env | None = None
+) -> tuple[Result, Interventions]:
+    """Run a fleet as `run` does, and log what each human who teleoperates saw and did.
+
+    Args:
+        config: configuration.
+        key: random key.
+        state: where to start; None pre-trains first.
+        env: the environment, if it is not the registered one that the configuration names.
+
+    Returns:
+        The Result of `run`, and Interventions[T, M].
+
+    Raises:
+        ValueError: if the configuration is not valid.
+    """
+    (metrics, interventions), last = _run(config, key, state, env, lambda fleet: fleet.logged_step)
+    return Result(metrics, last), interventions
+
+
+def _run(
+    config: Config, key: jax.Array, state: FleetState | None, env: envs.Env | None, choose: Callable[[Fleet], Any]
+) -> tuple[Any, FleetState]:
+    """Scan over the fleet's step that is chosen; return what it gives [T, ...] and the last state."""
     validate(config, env)
     env = env or envs.make(config.environment, config.backend)
     start = prepare(config, key, env) if state is None else state
 
-    def operate(config: Config, key: jax.Array, start: FleetState) -> Result:
-        fleet = make_fleet(config, env)
+    def operate(config: Config, key: jax.Array, start: FleetState) -> tuple[Any, FleetState]:
+        step = choose(make_fleet(config, env))
 
-        def timestep(state: FleetState, _: None) -> tuple[FleetState, Metrics]:
-            return fleet.step(state, jax.random.fold_in(key, state.timestep))
+        def timestep(state: FleetState, _: None) -> tuple[FleetState, Any]:
+            return step(state, jax.random.fold_in(key, state.timestep))
 
-        last, metrics = jax.lax.scan(timestep, start, length=config.num_steps)
-        return Result(metrics, last)
+        last, given = jax.lax.scan(timestep, start, length=config.num_steps)
+        return given, last
 
     _, key_steps = jax.random.split(key)
     return _one_by_one(operate)(config, key_steps, start)

@@ -69,31 +69,29 @@ def _run(arguments: argparse.Namespace) -> None:
     with _refusing():
         if arguments.checkpoint_every < 0 or arguments.checkpoint_every == 1:
             raise ValueError(f"checkpoint_every = {arguments.checkpoint_every} must be 0 (none) or at least 2 timesteps")
-        if arguments.resume:
-            path, config, seed = _to_resume(arguments, overrides)
-        else:
-            path, config, seed = _to_begin(arguments, overrides)
-            folder.check_free(path, overwrite=arguments.overwrite)
-            path.mkdir(parents=True, exist_ok=True)
-    with files.lock(path):
-        _run_in(path, config, seed, resume=bool(arguments.resume), checkpoint_every=arguments.checkpoint_every)
+        run = _to_resume(arguments, overrides) if arguments.resume else _to_begin(arguments, overrides)
+    if not arguments.resume:
+        folder.check_free(run.folder, overwrite=arguments.overwrite)
+        run.folder.mkdir(parents=True, exist_ok=True)
+    with files.lock(run.folder):
+        _run_in(run, resume=bool(arguments.resume), checkpoint_every=arguments.checkpoint_every)
 
 
-def _to_begin(arguments: argparse.Namespace, given: Mapping[str, Any]) -> tuple[Path, Config, int]:
-    """Return folder, configuration and seed of a new run.
+def _to_begin(arguments: argparse.Namespace, given: Mapping[str, Any]) -> folder.Run:
+    """Return a new run.
 
     Raises:
-        ValueError: if they cannot be used.
+        ValueError: if the configuration cannot be used.
     """
     if "environment" not in given:
         raise ValueError(f"ENV is missing; choose one of {', '.join(list_envs())}, or go on with a run by --resume RUN")
     overrides = {name: value for name, value in given.items() if name not in ("environment", "algorithm")}
     config, seed = make_config(given["environment"], given.get("algorithm", "cur"), **overrides), arguments.seed or 0
-    return arguments.output or folder.default_folder(config, seed), config, seed
+    return folder.Run(arguments.output or folder.default_folder(config, seed), config, seed, arguments.log_interventions)
 
 
-def _to_resume(arguments: argparse.Namespace, given: Mapping[str, Any]) -> tuple[Path, Config, int]:
-    """Return folder, configuration and seed of the run to go on with.
+def _to_resume(arguments: argparse.Namespace, given: Mapping[str, Any]) -> folder.Run:
+    """Return the run to go on with.
 
     Raises:
         ValueError: if there is none, or other parameters were given than it has.
@@ -101,61 +99,60 @@ def _to_resume(arguments: argparse.Namespace, given: Mapping[str, Any]) -> tuple
     if arguments.output or arguments.overwrite:
         raise ValueError("--resume goes on in the run's own folder; leave out --output and --overwrite")
     run = folder.read_run(arguments.resume)
+    if arguments.log_interventions and not run.logged:
+        raise ValueError("the run does not log interventions; leave out --log-interventions, or begin another run")
     has = folder.to_plain(run.config) | {"seed": run.seed}
     asked = folder.to_plain(run.config.replace(**given)) | {"seed": run.seed if arguments.seed is None else arguments.seed}
     for name, value in asked.items():
         if value != has[name]:
             raise ValueError(f"{name} = {value} is not the run's, which is {has[name]}; leave it out, or begin another run")
-    return run.folder, run.config, run.seed
+    return run
 
 
-def _run_in(path: Path, config: Config, seed: int, *, resume: bool, checkpoint_every: int) -> None:
+def _run_in(run: folder.Run, *, resume: bool, checkpoint_every: int) -> None:
     """Run in a folder that is locked."""
     begun = time.monotonic()
     with _refusing():
-        run = folder.read_run(path) if resume else None
-        metrics = folder.read_metrics(run) if run and folder.is_finished(run) else None
+        metrics = folder.read_metrics(run) if resume and folder.is_finished(run) else None
     if metrics:
-        say(f"{path} is finished; there is nothing to go on with")
+        say(f"{run.folder} is finished; there is nothing to go on with")
     else:
-        if resume:
-            folder.write_config(path, config, seed, sealed=False)
-        else:
-            folder.create(path, config, seed)
+        folder.write_config(run, sealed=False) if resume else folder.create(run)
         with _refusing():
-            metrics = _operate(path, config, seed, resume=resume, checkpoint_every=checkpoint_every)
-    print(f"\n{text.headline(config, seed)}\n\n{text.run_table(metrics, config)}\n")
-    print(f"{text.duration(time.monotonic() - begun)} in all. Run folder: {path}")
+            metrics = _operate(run, resume=resume, checkpoint_every=checkpoint_every)
+    print(f"\n{text.headline(run.config, run.seed)}\n\n{text.run_table(metrics, run.config)}\n")
+    print(f"{text.duration(time.monotonic() - begun)} in all. Run folder: {run.folder}")
 
 
-def _operate(path: Path, config: Config, seed: int, *, resume: bool, checkpoint_every: int) -> Metrics:
+def _operate(run: folder.Run, *, resume: bool, checkpoint_every: int) -> Metrics:
     """Run what is left, and write what it gave."""
     try:
-        metrics, state = operation.operate(path, config, seed, resume=resume, checkpoint_every=checkpoint_every)
+        metrics, state = operation.operate(run, resume=resume, checkpoint_every=checkpoint_every)
     except (KeyboardInterrupt, operation.Diverged):
-        _keep(path, config, seed)
+        _keep(run)
         raise
-    if get_algorithm(config.algorithm).pretrains:
-        folder.write_policy(path, state.learner)
-    _save(path, config, seed, metrics)
+    if get_algorithm(run.config.algorithm).pretrains:
+        folder.write_policy(run.folder, state.learner)
+    _save(run, metrics)
     return metrics
 
 
-def _keep(path: Path, config: Config, seed: int) -> None:
+def _keep(run: folder.Run) -> None:
     """Draw what an interrupted run has; remove its folder if that is nothing."""
-    if not (path / folder.METRICS).exists():
-        folder.discard(path)
+    path = run.folder / folder.METRICS
+    data = path.read_bytes() if path.exists() else b""
+    if data.count(b"\n") < 2:  # the head alone
+        folder.discard(run.folder)
         raise KeyboardInterrupt("before the first timestep; nothing was kept") from None
-    metrics = folder.parse_metrics((path / folder.METRICS).read_bytes(), config.num_steps)
-    _save(path, config, seed, metrics)
+    _save(run, folder.parse_metrics(data, run.config.num_steps))
 
 
-def _save(path: Path, config: Config, seed: int, metrics: Metrics) -> None:
+def _save(run: folder.Run, metrics: Metrics) -> None:
     from fleetjax.io import figure  # matplotlib takes a while to import
 
-    drawn = figure.draw(figure.group([(config, seed, metrics)]), text.headline(config, seed))
-    files.write(path / folder.FIGURE, figure.render(drawn))
-    folder.write_config(path, config, seed, sealed=True)
+    drawn = figure.draw(figure.group([(run.config, run.seed, metrics)]), text.headline(run.config, run.seed))
+    files.write(run.folder / folder.FIGURE, figure.render(drawn))
+    folder.write_config(run, sealed=True)
 
 
 def _list(arguments: argparse.Namespace) -> None:

@@ -146,7 +146,7 @@ def test_damaged_runs_and_impossible_evaluations_are_refused(copied, capsys, tmp
     assert "evaluation.json" not in contents(copied)
     config = fleetjax.make_config("navigation", "expert", num_robots=2)
     (tmp_path / "expert").mkdir()
-    folder.create(tmp_path / "expert", config, 0)
+    folder.create(folder.Run(tmp_path / "expert", config, 0))
     assert "trains no policy" in refused(capsys, "evaluate", tmp_path / "expert")
     (copied / "config.json").write_text("{}")
     for command in ("plot", "evaluate"):
@@ -197,7 +197,7 @@ def test_list_shows_environments_and_algorithms(capsys):
 def test_parameters_arrive_as_they_are_typed(monkeypatch, tmp_path):
     made = []
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(cli.folder, "create", lambda path, config, seed: made.append((config, seed)))
+    monkeypatch.setattr(cli.folder, "create", lambda run: made.append((run.config, run.seed)))
     monkeypatch.setattr(cli, "_operate", lambda *arguments, **options: (_ for _ in ()).throw(OSError("stop here")))
     flags = ["--hidden-sizes", "16", "8", "--no-normalize-observations", "--num-steps", "1e3", "--risk-threshold", ".25"]
     fleet = ["--algorithm", "expert", "--num-robots", "7", "--backend", "native"]

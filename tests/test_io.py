@@ -43,11 +43,12 @@ def saved(tmp_path, config):
     """A finished run folder."""
     path = tmp_path / "a run"
     path.mkdir()
-    folder.create(path, config, 5)
+    run = folder.Run(path, config, 5)
+    folder.create(run)
     folder.write_policy(path, make_policy())
     with contextlib.closing(folder.open_metrics(path)) as log:
         folder.append_metrics(log, make_metrics(), 0)
-    folder.write_config(path, config, 5, sealed=True)
+    folder.write_config(run, sealed=True)
     return path
 
 
@@ -155,7 +156,7 @@ def test_damaged_and_foreign_folders_are_refused_with_the_reason(saved, name):
 def test_metrics_that_make_no_sense_are_refused_even_where_the_digest_fits(saved, config, old, new, reason):
     path = saved / "metrics.csv"
     path.write_text(path.read_text().replace(old, new))
-    folder.write_config(saved, config, 5, sealed=True)
+    folder.write_config(folder.Run(saved, config, 5), sealed=True)
     with pytest.raises(ValueError, match=reason):
         folder.read_metrics(folder.read_run(saved))
 
@@ -163,7 +164,7 @@ def test_metrics_that_make_no_sense_are_refused_even_where_the_digest_fits(saved
 def test_a_policy_that_is_not_finite_is_refused(saved, config):
     policy = make_policy()
     folder.write_policy(saved, policy._replace(normalizer=policy.normalizer._replace(mean=jnp.full(8, jnp.nan))))
-    folder.write_config(saved, config, 5, sealed=True)
+    folder.write_config(folder.Run(saved, config, 5), sealed=True)
     with pytest.raises(ValueError, match="not finite"):
         folder.read_policy(folder.read_run(saved))
 
@@ -182,7 +183,7 @@ def test_overwriting_spares_what_fleetjax_did_not_write(saved, config):
     with pytest.raises(FileExistsError, match="--overwrite"):
         folder.check_free(saved, overwrite=False)
     folder.check_free(saved, overwrite=True)
-    folder.create(saved, config, 6)
+    folder.create(folder.Run(saved, config, 6))
     assert {path.name for path in saved.iterdir()} == {"config.json", "notes.txt"}
     assert folder.read_run(saved).seed == 6
 

@@ -2,17 +2,30 @@
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
 from fleetjax.config import Config
-from fleetjax.fleet import FleetState
+from fleetjax.fleet import FleetState, Interventions
 from fleetjax.learning.imitation import LearnerState
 from fleetjax.metrics import Metrics
-from fleetjax.run import evaluate, prepare, run
+from fleetjax.run import evaluate, prepare, run, run_logged
 
 CHUNKS = 100  # that a run is divided into, more or less
+
+
+class Chunk(NamedTuple):
+    """What some timesteps gave.
+
+    Attributes:
+        metrics: Metrics[C].
+        interventions: Interventions[C, M], if they were logged.
+    """
+
+    metrics: Metrics
+    interventions: Interventions | None
 
 
 def chunk_length(num_steps: int, within: int | None = None) -> int:
@@ -44,7 +57,7 @@ def chunks_of(num_steps: int, length: int) -> list[int]:
     return [*chunks[:-2], chunks[-2] + 1] if rest == 1 and full else chunks
 
 
-def start(config: Config, key: jax.Array, length: int) -> FleetState:
+def start(config: Config, key: jax.Array, length: int, *, logged: bool = False) -> FleetState:
     """Pre-train, and compile the first chunk of `length` timesteps meanwhile. Keyboard interrupts come through at once.
 
     Returns:
@@ -55,13 +68,24 @@ def start(config: Config, key: jax.Array, length: int) -> FleetState:
     try:
         lowered = pool.submit(lambda: jax.jit(prepare).lower(config, key)).result()
         state = pool.submit(lambda: jax.block_until_ready(lowered.compile()(config, key)))
-        pool.submit(lambda: _advance.lower(first, key, lowered.out_info).compile()).result()
+        pool.submit(lambda: _ADVANCE[logged].lower(first, key, lowered.out_info).compile()).result()
         return state.result()
     finally:
         pool.shutdown(wait=False)
 
 
-_advance = jax.jit(run, donate_argnums=2)  # the state's memory is used again: buffers can be large
+def _run_logged(config: Config, key: jax.Array, state: FleetState) -> tuple[Chunk, FleetState]:
+    result, interventions = run_logged(config, key, state)
+    return Chunk(result.metrics, interventions), result.state
+
+
+def _run(config: Config, key: jax.Array, state: FleetState) -> tuple[Chunk, FleetState]:
+    metrics, state = run(config, key, state)
+    return Chunk(metrics, None), state
+
+
+# Without and with a log of interventions. The state's memory is used again: buffers can be large.
+_ADVANCE = tuple(jax.jit(function, donate_argnums=2) for function in (_run, _run_logged))
 
 
 def shapes(config: Config, key: jax.Array) -> FleetState:
@@ -69,7 +93,9 @@ def shapes(config: Config, key: jax.Array) -> FleetState:
     return jax.eval_shape(prepare, config, key)
 
 
-def go_on(config: Config, key: jax.Array, state: FleetState, lengths: list[int]) -> Iterator[tuple[Metrics, FleetState]]:
+def go_on(
+    config: Config, key: jax.Array, state: FleetState, lengths: list[int], *, logged: bool = False
+) -> Iterator[tuple[Chunk, FleetState]]:
     """Run chunk after chunk; together they are `run(config, key, state)`.
 
     Args:
@@ -77,13 +103,14 @@ def go_on(config: Config, key: jax.Array, state: FleetState, lengths: list[int])
         key: the key of the whole run, the same for each chunk.
         state: where to start; its memory is taken over.
         lengths: timesteps of each chunk.
+        logged: whether to log interventions.
 
     Yields:
-        Metrics[C] in numpy arrays and the state behind the chunk, valid until the next one is asked for.
+        Chunk in numpy arrays and the state behind it, valid until the next one is asked for.
     """
     for length in lengths:
-        metrics, state = _advance(config.replace(num_steps=length), key, state)
-        yield jax.device_get(metrics), state
+        chunk, state = _ADVANCE[logged](config.replace(num_steps=length), key, state)
+        yield jax.device_get(chunk), state
 
 
 def start_evaluation(config: Config, key: jax.Array, learner: LearnerState) -> Iterator[Metrics]:
@@ -97,12 +124,12 @@ def start_evaluation(config: Config, key: jax.Array, learner: LearnerState) -> I
     begin = jax.jit(evaluate).lower(first, key, learner).compile()
     config = config.replace(algorithm="constraint")  # nobody teleoperates
     if others:
-        _advance.lower(config.replace(num_steps=others[0]), key, begin.out_info.state).compile()
+        _ADVANCE[False].lower(config.replace(num_steps=others[0]), key, begin.out_info.state).compile()
 
     def chunks() -> Iterator[Metrics]:
         metrics, state = begin(first, key, learner)
         yield jax.device_get(metrics)
-        yield from (metrics for metrics, _ in go_on(config, key, state, others))
+        yield from (chunk.metrics for chunk, _ in go_on(config, key, state, others))
 
     return chunks()
 

@@ -137,6 +137,9 @@ def _add_run(commands: Any, environment: str | None) -> None:
         default=1000,
         help="timesteps between checkpoints, of which the last two are kept; 0 = none [default: 1000]",
     )
+    run.add_argument(
+        "--log-interventions", action="store_true", help="log what humans who teleoperate see and do, for `fleetjax export`"
+    )
     parameters = run.add_argument_group(f"parameters{f' (defaults of {environment})' if environment else ''}")
     for name, field in FIELDS.items():
         if name != "environment":

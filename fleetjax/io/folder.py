@@ -24,7 +24,7 @@ from flax import serialization
 
 from fleetjax import envs
 from fleetjax.config import FIELDS, Config, validate
-from fleetjax.io import checkpoint, files
+from fleetjax.io import checkpoint, files, interventions
 from fleetjax.learning.imitation import LearnerState, make_learner
 from fleetjax.learning.networks import Normalizer
 from fleetjax.metrics import Metrics
@@ -32,6 +32,7 @@ from fleetjax.priority import get_algorithm
 from fleetjax.version import VERSION
 
 CONFIG, METRICS, FIGURE, POLICY, EVALUATION = "config.json", "metrics.csv", "figure.png", "policy.msgpack", "evaluation.json"
+DATA = (METRICS, POLICY, interventions.FILE)
 REALS = ("reward", "uncertainty", "policy_loss")  # the metrics that are no counts
 _COLUMNS = ("timestep", *Metrics._fields)
 _LARGEST = 2**31 - 1  # traced integers are i32
@@ -44,13 +45,15 @@ class Run(NamedTuple):
         folder: where it is.
         config: the configuration.
         seed: the seed of its key.
+        logged: whether interventions are logged.
         digests: SHA-256 by file name.
     """
 
     folder: Path
     config: Config
     seed: int
-    digests: Mapping[str, str]
+    logged: bool = False
+    digests: Mapping[str, str] = {}
 
 
 def default_folder(config: Config, seed: int) -> Path:
@@ -72,17 +75,17 @@ def check_free(path: Path, *, overwrite: bool) -> None:
     raise FileExistsError(f"{path} exists already; choose another --output, or pass --overwrite")
 
 
-def create(path: Path, config: Config, seed: int) -> None:
+def create(run: Run) -> None:
     """Write the configuration of a new run; an older run in the folder goes."""
-    for name in (CONFIG, METRICS, FIGURE, POLICY, EVALUATION):
-        (path / name).unlink(missing_ok=True)
-    shutil.rmtree(path / checkpoint.FOLDER, ignore_errors=True)
-    write_config(path, config, seed, sealed=False)
+    for name in (CONFIG, FIGURE, EVALUATION, *DATA):
+        (run.folder / name).unlink(missing_ok=True)
+    shutil.rmtree(run.folder / checkpoint.FOLDER, ignore_errors=True)
+    write_config(run, sealed=False)
 
 
 def discard(path: Path) -> None:
-    """Remove a run folder in which nothing but a configuration was written."""
-    for name in (CONFIG, files.LOCK):
+    """Remove a run folder in which no timestep was written."""
+    for name in (CONFIG, files.LOCK, *DATA):
         (path / name).unlink(missing_ok=True)
     with contextlib.suppress(OSError):  # it holds files of others
         path.rmdir()
@@ -95,12 +98,12 @@ def versions() -> dict[str, str]:
     return {"fleetjax": VERSION, "jax": jax.__version__, "mujoco": mujoco.__version__}
 
 
-def write_config(folder: Path, config: Config, seed: int, *, sealed: bool) -> None:
+def write_config(run: Run, *, sealed: bool) -> None:
     """Write `config.json`: every field, the seed, versions, and the SHA-256 of the data files that are there, if `sealed`."""
-    data = {name: folder / name for name in (METRICS, POLICY)}
+    data = {name: run.folder / name for name in DATA}
     digests = {name: files.digest(path.read_bytes()) for name, path in data.items() if sealed and path.exists()}
-    content = {**identity(config, seed), "versions": versions(), "sha256": digests}
-    files.write_json(folder / CONFIG, content)
+    content = {"log_interventions": run.logged, "versions": versions(), "sha256": digests}
+    files.write_json(run.folder / CONFIG, identity(run.config, run.seed) | content)
 
 
 def to_plain(config: Config) -> dict[str, Any]:
@@ -174,7 +177,7 @@ def read_run(folder: Path) -> Run:
             raise ValueError(f"seed = {seed!r} must be a whole number")
         if not isinstance(digests, dict):
             raise ValueError("the SHA-256 of the data files are missing")
-        return Run(folder, _from_plain(content["config"]), seed, digests)
+        return Run(folder, _from_plain(content["config"]), seed, content.get("log_interventions") is True, digests)
 
 
 def is_finished(run: Run) -> bool:
@@ -246,6 +249,19 @@ def parse_metrics(data: bytes, num_steps: int) -> Metrics:
     _expect(all(row[:1] == [str(t)] for t, row in enumerate(rows)), "timesteps are missing")
     columns = zip(Metrics._fields, list(zip(*rows, strict=True))[1:], strict=True)
     return Metrics._make(np.array(x, np.float32 if name in REALS else np.int32) for name, x in columns)
+
+
+def read_interventions(run: Run) -> list[np.ndarray]:
+    """Read the interventions of a run, see `interventions.split`.
+
+    Raises:
+        ValueError: if they were not logged, or the file is missing or damaged.
+    """
+    if not run.logged:
+        raise ValueError(f"{run.folder} has no log of interventions; run with --log-interventions")
+    with _blame(run.folder / interventions.FILE):
+        spec = envs.make(run.config.environment, run.config.backend).spec
+        return interventions.split(interventions.parse(_read_data(run, interventions.FILE), spec))
 
 
 def read_policy(run: Run) -> LearnerState:

@@ -14,9 +14,10 @@ from typing import Any, NamedTuple
 
 import jax
 
-from fleetjax.config import Config
+from fleetjax import envs
+from fleetjax.envs import EnvSpec
 from fleetjax.fleet import FleetState
-from fleetjax.io import checkpoint, execution, files, folder, text
+from fleetjax.io import checkpoint, execution, files, folder, interventions, text
 from fleetjax.io.progress import progress, say
 from fleetjax.metrics import Metrics, first_divergence
 from fleetjax.priority import get_algorithm
@@ -26,27 +27,57 @@ class Diverged(ArithmeticError):
     """Something learnt is not finite any more."""
 
 
+class Journal:
+    """What a run leaves as it goes on: `metrics.csv`, and the log of interventions if there is one.
+
+    Args:
+        path: folder of the run.
+        spec: its environment's, if interventions are logged.
+        notes: what `mark` returned when the files were as they shall be again; None begins new ones.
+    """
+
+    def __init__(self, path: Path, spec: EnvSpec | None, notes: Mapping[str, Any] | None = None):
+        notes = notes or {}
+        self.spec = spec
+        self.metrics = folder.open_metrics(path, notes.get("metrics"))
+        self.interventions = interventions.open_log(path, notes.get("interventions")) if spec else None
+
+    def append(self, chunk: execution.Chunk, first: int) -> None:
+        """Add a chunk of timesteps, from `first` on."""
+        folder.append_metrics(self.metrics, chunk.metrics, first)
+        if self.interventions and self.spec and chunk.interventions:
+            interventions.append(self.interventions, chunk.interventions, first, self.spec)
+
+    def mark(self) -> dict[str, Any]:
+        """Put it all on the disk; return what is needed to cut it back to this."""
+        return {"metrics": self.metrics.mark()} | ({"interventions": self.interventions.mark()} if self.interventions else {})
+
+    def close(self) -> None:
+        """Close the files."""
+        self.metrics.close()
+        if self.interventions:
+            self.interventions.close()
+
+
 class Start(NamedTuple):
     """Where an operation starts.
 
     Attributes:
         state: the fleet.
         metrics: Metrics[t] so far, in numpy arrays; None at t = 0.
-        log: the file of metrics.
+        journal: where what comes is written.
     """
 
     state: FleetState
     metrics: Metrics | None
-    log: files.Log
+    journal: Journal
 
 
-def operate(path: Path, config: Config, seed: int, *, resume: bool, checkpoint_every: int) -> tuple[Metrics, FleetState]:
+def operate(run: folder.Run, *, resume: bool, checkpoint_every: int) -> tuple[Metrics, FleetState]:
     """Run what is left of a run.
 
     Args:
-        path: its folder, which this process has locked.
-        config: its configuration.
-        seed: the seed of its key.
+        run: its folder, which this process has locked, its configuration, and whether interventions are logged.
         resume: whether to look for checkpoints; else it starts from t = 0.
         checkpoint_every: timesteps between checkpoints; 0 = none.
 
@@ -59,32 +90,31 @@ def operate(path: Path, config: Config, seed: int, *, resume: bool, checkpoint_e
         Diverged: if what is learnt is not finite any more.
         KeyboardInterrupt: if it was asked to stop; the message says how to go on.
     """
-    begun, key, total = time.monotonic(), jax.random.key(seed), config.num_steps
+    begun, key, total = time.monotonic(), jax.random.key(run.seed), run.config.num_steps
     length = execution.chunk_length(total, checkpoint_every)
-    identity = folder.identity(config, seed)
-    say(f"{text.headline(config, seed)}, on the {jax.default_backend().upper()} ...")
-    start = _resume(path, config, key, identity) if resume else _begin(path, config, key, length)
-    state, before, log = start
+    say(f"{text.headline(run.config, run.seed)}, on the {jax.default_backend().upper()} ...")
+    state, before, journal = _resume(run, key, length) if resume else _begin(run, key, length)
     say(f"ready after {text.duration(time.monotonic() - begun)}")
-    chunks = [before] if before else []
+    gathered = [before] if before else []
     done = saved = int(state.timestep)
-    writer = checkpoint.Writer(path, identity)
-    with contextlib.closing(log), progress(config, before) as show, stoppable() as asked_to_stop:
-        for metrics, state in execution.go_on(config, key, start.state, execution.chunks_of(total - done, length)):
-            folder.append_metrics(log, metrics, done)
-            chunks.append(metrics)
-            done += len(metrics.successes)
-            show(metrics)
-            _check(metrics, done, path)
-            stop = asked_to_stop() and done < total
+    writer = checkpoint.Writer(run.folder, folder.identity(run.config, run.seed))
+    chunks = execution.go_on(run.config, key, state, execution.chunks_of(total - done, length), logged=run.logged)
+    with contextlib.closing(journal), progress(run.config, before) as show, stoppable() as asked_to_stop:
+        for chunk, after in chunks:
+            journal.append(chunk, done)
+            gathered.append(chunk.metrics)
+            done += len(chunk.metrics.successes)
+            show(chunk.metrics)
+            _check(chunk.metrics, done, run.folder)
+            state, stop = after, asked_to_stop() and done < total
             if stop or (checkpoint_every and saved + checkpoint_every <= done < total):
-                writer.write(state, {"metrics": log.mark()})
+                writer.write(state, journal.mark())
                 saved = done
             if stop:
                 writer.wait()
-                raise KeyboardInterrupt(f"at t = {done} of {total}; go on with: fleetjax run --resume {path}")
+                raise KeyboardInterrupt(f"at t = {done} of {total}; go on with: fleetjax run --resume {run.folder}")
         writer.wait()
-    return execution.join(chunks), state
+    return execution.join(gathered), state
 
 
 def _check(chunk: Metrics, done: int, path: Path) -> None:
@@ -107,32 +137,39 @@ def _check(chunk: Metrics, done: int, path: Path) -> None:
         )
 
 
-def _begin(path: Path, config: Config, key: jax.Array, length: int) -> Start:
+def _spec(run: folder.Run) -> EnvSpec | None:
+    return envs.make(run.config.environment, run.config.backend).spec if run.logged else None
+
+
+def _begin(run: folder.Run, key: jax.Array, length: int) -> Start:
     """Pre-train."""
-    first = "pre-training" if get_algorithm(config.algorithm).pretrains else "preparing"
+    first = "pre-training" if get_algorithm(run.config.algorithm).pretrains else "preparing"
     say(f"compiling and {first} ...")
-    state = execution.start(config, key, min(length, config.num_steps))
-    return Start(state, None, folder.open_metrics(path))
+    state = execution.start(run.config, key, min(length, run.config.num_steps), logged=run.logged)
+    return Start(state, None, Journal(run.folder, _spec(run)))
 
 
-def _resume(path: Path, config: Config, key: jax.Array, identity: Mapping[str, Any]) -> Start:
+def _resume(run: folder.Run, key: jax.Array, length: int) -> Start:
     """Read the newest checkpoint that is whole, and say which are not."""
+    logs = {"metrics": folder.METRICS} | ({"interventions": interventions.FILE} if run.logged else {})
 
     def check(notes: Mapping[str, Any]) -> None:
-        files.beginning(path / folder.METRICS, notes["metrics"])
+        for name, file in logs.items():
+            files.beginning(run.folder / file, notes[name])
 
-    found, refused = checkpoint.restore(path, identity, execution.shapes(config, key), check)
+    identity = folder.identity(run.config, run.seed)
+    found, refused = checkpoint.restore(run.folder, identity, execution.shapes(run.config, key), check)
     for reason in refused:
         say(f"left out {reason}")
     if found is None:
         if refused:
-            raise ValueError(f"{path} has no checkpoint that could be used; run it anew with --output {path} --overwrite")
+            raise ValueError(f"{run.folder} has no checkpoint that could be used; run it anew, with --overwrite")
         say("no checkpoint was written yet; from the start")
-        return _begin(path, config, key, execution.chunk_length(config.num_steps))
+        return _begin(run, key, length)
     say(f"going on from {found.path}")
-    mark = found.notes["metrics"]
-    metrics = folder.parse_metrics(files.beginning(path / folder.METRICS, mark), config.num_steps)
-    return Start(found.state, metrics, folder.open_metrics(path, mark))
+    data = files.beginning(run.folder / folder.METRICS, found.notes["metrics"])
+    metrics = folder.parse_metrics(data, run.config.num_steps)
+    return Start(found.state, metrics, Journal(run.folder, _spec(run), found.notes))
 
 
 @contextlib.contextmanager

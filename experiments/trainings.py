@@ -171,8 +171,8 @@ TRAININGS = {
         episode_length=allegro_hand.HORIZON,
         stages=(
             Stage(TURNING, turning, options={"tolerance": 0.4}),
-            Stage(TURNING, turning, options={"tolerance": 0.25}, begins=40_000_000),
-            Stage(TURNING, turning, begins=60_000_000),
+            Stage(TURNING, turning, options={"tolerance": 0.2}, begins=23_500_000),
+            Stage(TURNING, turning, begins=30_000_000),
         ),
     ),
     "anymal": Training(

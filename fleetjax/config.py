@@ -101,6 +101,7 @@ class Config:
 
 
 FIELDS: dict[str, Field] = {f.name: f.metadata["field"] for f in dataclasses.fields(Config)}
+_LARGEST = 2**31 - 1
 _TRACED = [name for name, field in FIELDS.items() if field.traced]
 _STATIC = [name for name, field in FIELDS.items() if not field.traced]
 jax.tree_util.register_dataclass(Config, data_fields=_TRACED, meta_fields=_STATIC)
@@ -110,18 +111,22 @@ def _typed(name: str, value: Any) -> Any:
     field = FIELDS[name]
     if not field.traced:
         if field.kind is tuple:
-            value = tuple(value)
-            valid = all(isinstance(size, (int, np.integer)) for size in value)
+            value = tuple(value) if isinstance(value, (tuple, list)) else value
+            valid = isinstance(value, tuple) and all(isinstance(x, (int, np.integer)) and not isinstance(x, bool) for x in value)
         else:
             valid = isinstance(value, field.kind) or (field.kind is int and isinstance(value, np.integer))
         if not valid or isinstance(value, bool):
             raise ValueError(f"{name} = {value!r} must be of type {field.kind.__name__}")
+        if any(abs(x) > _LARGEST for x in (value if field.kind is tuple else [value] if field.kind is int else [])):
+            raise ValueError(f"{name} = {value!r} must lie within 32 bits")
         return int(value) if field.kind is int else value
     try:
         array = jnp.asarray(value)
+        if isinstance(value, (list, tuple)) or not array.size:  # arrays are sweeps
+            raise TypeError
     except OverflowError:
         raise ValueError(f"{name} = {value!r} must lie within 32 bits") from None
-    except TypeError:
+    except (TypeError, ValueError):
         raise ValueError(f"{name} = {value!r} must be a number") from None
     if field.kind is int and not jnp.issubdtype(array.dtype, jnp.integer):
         whole = _is_concrete(array) and np.all(np.asarray(array) == np.round(np.asarray(array)))
@@ -172,11 +177,12 @@ def make_config(environment: "str | envs.Env", algorithm: str = "cur", **overrid
     fields |= {"environment": name, "algorithm": algorithm} | overrides
     if algorithm == "expert" and "num_humans" not in overrides:
         fields["num_humans"] = fields["num_robots"]
-    if algorithm == "constraint":  # as many gradient steps as the online arms, and as many human timesteps
-        budget = {"pretraining_steps": fields["pretraining_steps"] + fields["num_steps"] * fields["gradient_steps"]}
-        budget["extra_demonstrations"] = envs.CUR_HUMAN_TIME.get(name, 0)
-        fields |= {k: v for k, v in budget.items() if k not in overrides}
     config = Config().replace(**fields)
+    if algorithm == "constraint":  # as many gradient steps as the online arms, and as many human timesteps
+        steps = int(config.pretraining_steps) if _is_concrete(config.pretraining_steps) else config.pretraining_steps
+        budget = {"pretraining_steps": steps + config.num_steps * config.gradient_steps}
+        budget["extra_demonstrations"] = envs.CUR_HUMAN_TIME.get(name, 0)
+        config = config.replace(**{field: value for field, value in budget.items() if field not in overrides})
     validate(config, environment if isinstance(environment, envs.Env) else None)
     return config
 
@@ -241,5 +247,7 @@ def _check_data(config: Config, algorithm: priority.Algorithm) -> None:
             f"batch_size = {config.batch_size} is larger than the data: num_demonstrations + extra_demonstrations = {pairs}"
         )
     needed = needed_human_capacity(config)
+    if max(needed, config.human_capacity) > _LARGEST:
+        raise ValueError(f"human_capacity = {needed} pairs, which this run can give, must lie within 32 bits; shorten num_steps")
     if config.human_capacity < needed:
         raise ValueError(f"human_capacity = {config.human_capacity} is less than the {needed} pairs that this run can give")

@@ -230,12 +230,12 @@ def get_algorithm(name: str) -> Algorithm:
     Raises:
         ValueError: if there is none of that name; the message has the closest ones.
     """
-    if name not in _ALGORITHMS:
+    if not isinstance(name, str) or name not in _ALGORITHMS:
         raise ValueError(unknown("algorithm", name, _ALGORITHMS))
     return _ALGORITHMS[name]
 
 
-def unknown(field: str, name: str, known) -> str:
+def unknown(field: str, name: object, known) -> str:
     """Return the message for an unknown name, with the closest known ones."""
-    close = difflib.get_close_matches(name, list(known), n=3, cutoff=0.3) or list(known)
+    close = difflib.get_close_matches(str(name), list(known), n=3, cutoff=0.3) or list(known)
     return f"{field} = {name!r} is unknown; the closest are {', '.join(close)}"

@@ -1,4 +1,4 @@
-"""The command line: `fleetjax run`, `list`, `plot`, `evaluate` and `render`.
+"""The command line: `fleetjax run`, `list`, `plot`, `evaluate`, `export` and `render`.
 
 What cannot be used is refused with one line on stderr and exit code 2, before anything is computed.
 """
@@ -18,7 +18,7 @@ import numpy as np
 from fleetjax import envs
 from fleetjax.config import FIELDS, Config, make_config, validate
 from fleetjax.envs import get_defaults, list_envs
-from fleetjax.io import execution, files, flags, folder, operation, text
+from fleetjax.io import execution, export, files, flags, folder, operation, text
 from fleetjax.io.flags import Refusal
 from fleetjax.io.progress import progress, say
 from fleetjax.metrics import Metrics
@@ -36,7 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         int: exit code: 0, 1 for a run that diverged, 2 for input that cannot be used, 130 after Ctrl-C.
     """
-    commands = {"run": _run, "list": _list, "plot": _plot, "evaluate": _evaluate, "render": _render}
+    commands = {"run": _run, "list": _list, "plot": _plot, "evaluate": _evaluate, "export": _export, "render": _render}
     try:
         arguments = flags.parse(sys.argv[1:] if argv is None else argv)
         commands[arguments.command](arguments)
@@ -216,6 +216,21 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     content = {"num_steps": config.num_steps, "seed": seed, "totals": total, "versions": folder.versions()}
     files.write_json(output, content)
     print(text.evaluation_table(metrics, config))
+
+
+def _export(arguments: argparse.Namespace) -> None:
+    with _refusing():
+        export.check(arguments.format)
+        run = folder.read_run(arguments.run)
+        found = folder.read_interventions(run)
+    name = "robomimic.hdf5" if arguments.format == "robomimic" else arguments.format
+    output = arguments.output or run.folder / name
+    folder.check_free(output, overwrite=arguments.overwrite)
+    with _refusing():
+        export.export(found, run.config, envs.make(run.config.environment, run.config.backend).spec, output, arguments.format)
+    steps = sum(map(len, found))
+    say(f"{text.plural(len(found), 'intervention')}, {text.plural(steps, 'timestep')} of human actions")
+    print(output)
 
 
 def _render(arguments: argparse.Namespace) -> None:

@@ -108,18 +108,34 @@ jax.tree_util.register_dataclass(Config, data_fields=_TRACED, meta_fields=_STATI
 
 
 def _typed(name: str, value: Any) -> Any:
+    """Return a value as its field holds it.
+
+    Raises:
+        ValueError: if it has another type, or is an integer beyond 32 bits.
+    """
+    return _as_array(name, value) if FIELDS[name].traced else _as_static(name, value)
+
+
+def _as_static(name: str, value: Any) -> Any:
+    kind = FIELDS[name].kind
+    if kind is str and isinstance(value, str):
+        return value
+    if kind is str or not (isinstance(value, (tuple, list)) if kind is tuple else _is_integer(value)):
+        raise ValueError(f"{name} = {value!r} must be of type {kind.__name__}")
+    numbers = list(value) if kind is tuple else [value]
+    if not all(map(_is_integer, numbers)):
+        raise ValueError(f"{name} = {value!r} must hold whole numbers")
+    if any(abs(number) > _LARGEST for number in numbers):
+        raise ValueError(f"{name} = {value!r} must lie within 32 bits")
+    return tuple(map(int, numbers)) if kind is tuple else int(numbers[0])
+
+
+def _is_integer(value: Any) -> bool:
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+
+
+def _as_array(name: str, value: Any) -> jax.Array:
     field = FIELDS[name]
-    if not field.traced:
-        if field.kind is tuple:
-            value = tuple(value) if isinstance(value, (tuple, list)) else value
-            valid = isinstance(value, tuple) and all(isinstance(x, (int, np.integer)) and not isinstance(x, bool) for x in value)
-        else:
-            valid = isinstance(value, field.kind) or (field.kind is int and isinstance(value, np.integer))
-        if not valid or isinstance(value, bool):
-            raise ValueError(f"{name} = {value!r} must be of type {field.kind.__name__}")
-        if any(abs(x) > _LARGEST for x in (value if field.kind is tuple else [value] if field.kind is int else [])):
-            raise ValueError(f"{name} = {value!r} must lie within 32 bits")
-        return int(value) if field.kind is int else value
     try:
         array = jnp.asarray(value)
         if isinstance(value, (list, tuple)) or not array.size:  # arrays are sweeps
@@ -248,6 +264,8 @@ def _check_data(config: Config, algorithm: priority.Algorithm) -> None:
         )
     needed = needed_human_capacity(config)
     if max(needed, config.human_capacity) > _LARGEST:
-        raise ValueError(f"human_capacity = {needed} pairs, which this run can give, must lie within 32 bits; shorten num_steps")
+        raise ValueError(
+            f"human_capacity = {needed} pairs, which this run can give, must lie within 32 bits; shorten num_steps"
+        )
     if config.human_capacity < needed:
         raise ValueError(f"human_capacity = {config.human_capacity} is less than the {needed} pairs that this run can give")

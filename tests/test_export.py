@@ -22,6 +22,7 @@ import fleetjax
 from fleetjax.envs import EnvSpec
 from fleetjax.fleet import Interventions
 from fleetjax.io import export, folder, interventions
+from fleetjax.version import VERSION
 
 SPECS = {
     "continuous": EnvSpec("navigation", 5, 2, 100, 0.05),
@@ -99,12 +100,13 @@ def test_nothing_but_the_data_set_is_written(made):
     }
 
 
-def test_every_data_set_names_the_run_that_made_it(made):
+def test_every_data_set_names_the_run_that_made_it(made, spec):
     with h5py.File(made["robomimic"]) as file:
         sources = [json.loads(str(file["data"].attrs["fleetjax"]))]
     sources.append(json.loads((made["lerobot"] / "meta/fleetjax.json").read_text()))
     sources.append(minari.MinariDataset(made["minari"] / "data").storage.metadata["fleetjax"])
-    assert all(source == {"version": fleetjax.__version__, "config": folder.to_plain(CONFIG)} for source in sources)
+    expected = {"version": VERSION, "control_step": spec.control_step, "config": folder.to_plain(CONFIG)}
+    assert all(source == expected for source in sources)
 
 
 # LeRobot

@@ -110,9 +110,9 @@ def _columns(records: np.ndarray) -> dict[str, np.ndarray]:
     return {**fields, **flags, "human_action": action}
 
 
-def _source(config: Config) -> dict[str, Any]:
-    """Return what made the data set."""
-    return {"version": VERSION, "config": folder.to_plain(config)}
+def _source(config: Config, spec: EnvSpec) -> dict[str, Any]:
+    """Return what made the data set; the seconds between two timesteps are exact here."""
+    return {"version": VERSION, "control_step": spec.control_step, "config": folder.to_plain(config)}
 
 
 def _write_lerobot(interventions: list[np.ndarray], config: Config, spec: EnvSpec, path: Path) -> None:
@@ -158,7 +158,7 @@ def _write_lerobot(interventions: list[np.ndarray], config: Config, spec: EnvSpe
     _write_parquet(path / episodes.format(chunk_index=0, file_index=0), table)
     tasks = pd.Index([spec.name], dtype=object, name="task")
     pd.DataFrame({"task_index": [0]}, index=tasks).to_parquet(path / "meta/tasks.parquet", engine="pyarrow")
-    for name, content in {"info": info, "stats": _statistics(frames), "fleetjax": _source(config)}.items():
+    for name, content in {"info": info, "stats": _statistics(frames), "fleetjax": _source(config, spec)}.items():
         files.write_json(path / "meta" / f"{name}.json", content)
 
 
@@ -225,7 +225,7 @@ def _write_robomimic(interventions: list[np.ndarray], config: Config, spec: EnvS
         data = file.create_group("data")
         data.attrs["total"] = sum(len(records) for records in interventions)
         data.attrs["env_args"] = json.dumps(made_by)
-        data.attrs["fleetjax"] = json.dumps(_source(config))
+        data.attrs["fleetjax"] = json.dumps(_source(config, spec))
         for i, records in enumerate(interventions):
             demo = data.create_group(f"demo_{i}")
             demo.attrs["num_samples"] = len(records)
@@ -269,7 +269,7 @@ def _write_minari(interventions: list[np.ndarray], config: Config, spec: EnvSpec
             "minari_version": minari.__version__,
             "algorithm_name": config.algorithm,
             "description": f"Interventions of {fleet}, environment {spec.name}",
-            "fleetjax": _source(config),
+            "fleetjax": _source(config, spec),
         }
     )
     storage.update_episodes(map(episode, interventions))

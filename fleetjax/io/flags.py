@@ -10,6 +10,7 @@ from typing import Any, NoReturn
 
 from fleetjax.config import FIELDS, Config, Field
 from fleetjax.envs import get_defaults, list_envs
+from fleetjax.io.export import FORMATS
 from fleetjax.priority import unknown
 from fleetjax.version import VERSION
 
@@ -60,6 +61,8 @@ class _Parser(argparse.ArgumentParser):
         return f"unknown flag {flag}; the closest is {close[0]}"
 
 
+_EXPORT_ABOUT = """Write what humans who teleoperated saw and did, an episode for each intervention, as other tools read it. The
+run must have been made with --log-interventions."""
 _RENDER_ABOUT = """Draw robots as an animation, a grid of tiles. Who is teleoperated is tinted blue, who is in violation red.
 
 expert: the supervisor acts on every robot. robot: the trained policy of a run acts, and nobody teleoperates. mixed: the fleet
@@ -100,6 +103,17 @@ def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser
     evaluate.add_argument("--num-steps", metavar="N", type=_integer, default=10_000, help="timesteps [default: 10000]")
     evaluate.add_argument("--seed", metavar="N", type=_seed, help="random seed [default: the run's, plus 1]")
     evaluate.add_argument("--overwrite", action="store_true", help="replace the evaluation in the run folder")
+
+    export = commands.add_parser("export", help="write a run's interventions as a data set", description=_EXPORT_ABOUT)
+    export.add_argument("run", metavar="RUN", type=Path, help="run folder")
+    export.add_argument("--format", choices=FORMATS, required=True, help="of the data set")
+    export.add_argument(
+        "--output",
+        metavar="PATH",
+        type=Path,
+        help="folder, or .hdf5 file for robomimic [default: RUN/FORMAT or RUN/robomimic.hdf5]",
+    )
+    export.add_argument("--overwrite", action="store_true", help="replace what is there")
 
     render = commands.add_parser("render", help="draw robots as an animation", description=_RENDER_ABOUT)
     render.add_argument("source", metavar="RUN|ENV", help="run folder, or environment")

@@ -89,6 +89,21 @@ def test_native_is_mujoco(name):
     assert not after.diverged.any()
 
 
+@each_robot
+def test_the_number_of_threads_changes_no_bit(name, monkeypatch):
+    states, controls = mixed(name)
+    expected = states
+    for _ in range(5):
+        expected = mover(name, "native")(expected, controls)
+    for threads in ("1", "2", "3"):
+        monkeypatch.setenv("FLEETJAX_NUM_THREADS", threads)
+        step = compiled(jax.vmap(make_physics(f"{name}.xml", substeps=ROBOTS[name].module.SUBSTEPS, backend="native").step))
+        after = states
+        for _ in range(5):
+            after = jax.tree.map(np.asarray, step(after, controls, jnp.ones(NUM_ROBOTS, bool)))
+        assert_same(after, expected)
+
+
 # Median and 95th percentile that the largest error of a robot must stay below: three times what was measured, and three (the
 # hand) to ten times.
 BOUNDS = {  # m and rad; m/s and rad/s; N and N m; m/s^2 and rad/s^2

@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import h5py
 import jax
 import numpy as np
 import pytest
@@ -20,8 +21,8 @@ import fleetjax
 from fleetjax import cli
 from fleetjax.io import checkpoint, files, folder, operation
 
-RUN = ("run", "navigation", *TINY, "--seed", "3")
-RESULTS = ("metrics.csv", "policy.msgpack")
+RUN = ("run", "navigation", *TINY, "--seed", "3", "--log-interventions")
+RESULTS = ("metrics.csv", "policy.msgpack", "interventions.bin")
 
 
 def run_here(*arguments: object) -> int:
@@ -83,8 +84,36 @@ def test_an_undisturbed_run_is_the_librarys_bit_for_bit(whole):
     assert np.sum(expected.metrics.hard_resets) > 0
 
 
+def test_interventions_are_logged_and_exported(whole, tmp_path, capsys):
+    run = folder.read_run(whole)
+    records = np.concatenate(folder.read_interventions(run))
+    metrics = folder.read_metrics(run)
+    np.testing.assert_array_equal(np.bincount(records["timestep"], minlength=STEPS), metrics.teleop_steps)
+    assert np.all(np.abs(records["human_action"]) <= 1)
+    assert np.any(records["human_action"] != records["robot_action"])
+    episodes = {(robot, episode) for robot, episode in records[["robot", "episode"]].tolist()}
+    assert len(episodes) > 4
+    for name in ("lerobot", "robomimic", "minari"):
+        output = tmp_path / name
+        assert run_here("export", whole, "--format", name, "--output", output) == 0
+        printed = capsys.readouterr()
+        assert f"{records.size} timesteps of human actions" in printed.err
+        assert printed.out == f"{output}\n"
+        assert "exists already" in refused(capsys, "export", whole, "--format", name, "--output", output)
+    with h5py.File(tmp_path / "robomimic") as file:
+        assert file["data"].attrs["total"] == records.size
+
+
+def test_what_was_not_logged_is_not_exported(whole, tmp_path, capsys):
+    path = Path(shutil.copytree(whole, tmp_path / "copy"))
+    folder.write_config(folder.read_run(path)._replace(logged=False), sealed=True)
+    assert "run with --log-interventions" in refused(capsys, "export", path, "--format", "minari")
+    assert "invalid choice: 'csv'" in refused(capsys, "export", path, "--format", "csv")
+    assert "does not log interventions" in refused(capsys, "run", "--resume", path, "--log-interventions")
+
+
 def test_ctrl_c_writes_a_checkpoint_from_which_the_run_goes_on(stopped, whole, capsys):
-    assert set(contents(stopped)) == {"config.json", "metrics.csv", "figure.png"}
+    assert set(contents(stopped)) == {"config.json", "metrics.csv", "figure.png", "interventions.bin"}
     assert (stopped / "metrics.csv").read_text().splitlines() == (whole / "metrics.csv").read_text().splitlines()[:67]
     assert "policy.msgpack is missing" in refused(capsys, "evaluate", stopped)
     assert run_here("plot", stopped, "--output", stopped / "figure.pdf") == 0
@@ -153,6 +182,10 @@ def edit(path: Path, **fields) -> None:
     (path / checkpoint.MANIFEST).write_text(json.dumps(manifest | fields))
 
 
+def notes(path: Path) -> dict:
+    return json.loads((path / checkpoint.MANIFEST).read_text())["notes"]
+
+
 DAMAGES = {
     "truncated": (truncate, "damaged"),
     "bit flipped": (flip, "damaged"),
@@ -163,6 +196,11 @@ DAMAGES = {
     "not fleetjax's": (lambda path: (path / checkpoint.MANIFEST).write_text("[]"), "is not fleetjax's"),
     "other metrics": (lambda path: edit(path, notes={"metrics": {"size": 9, "sha256": ""}}), "metrics.csv is not as it was"),
     "a file more": (lambda path: (path / "stray").write_text("?"), "damaged"),
+    "other log": (
+        lambda path: edit(path, notes=notes(path) | {"interventions": {"size": 9, "sha256": ""}}),
+        "interventions.bin is",
+    ),
+    "no log": (lambda path: edit(path, notes={"metrics": notes(path)["metrics"]}), "interventions"),
     "emptied": (lambda path: shutil.rmtree(path / checkpoint.ARRAYS), "damaged"),
 }
 

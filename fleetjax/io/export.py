@@ -56,6 +56,7 @@ _ROBOMIMIC = {
     "priority": "priority",
 }
 _MINARI_INFOS = {"next_observation": "next_obs", "success": "success", "timeout": "timeout", **_EXTRAS}
+_FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _GYM = 2  # robomimic's number for environments that it makes through Gym
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
@@ -120,44 +121,27 @@ def _write_lerobot(interventions: list[np.ndarray], config: Config, spec: EnvSpe
     import pandas as pd
 
     rate = max(1, round(1 / spec.control_step))
-    lengths = np.array([len(records) for records in interventions])
-    ends = np.cumsum(lengths)
     frames = _frames(interventions, rate)
-    parts = [{name: x[end - size : end] for name, x in frames.items()} for size, end in zip(lengths, ends, strict=True)]
-    count, first = len(interventions), np.zeros(len(interventions), np.int64)
-    file = "{}/chunk-{{chunk_index:03d}}/file-{{file_index:03d}}.parquet"
-    data, episodes = (file.format(place) for place in ("data", "meta/episodes"))
-    table = {
-        "episode_index": np.arange(count),
-        "tasks": [[spec.name]] * count,
-        "length": lengths,
-        "data/chunk_index": first,
-        "data/file_index": first,
-        "dataset_from_index": ends - lengths,
-        "dataset_to_index": ends,
-        **_flat([_statistics(part) for part in parts]),
-        "meta/episodes/chunk_index": first,
-        "meta/episodes/file_index": first,
-    }
+    first = _FILE.format(chunk_index=0, file_index=0)
+    _write_parquet(path / "data" / first, {name: _arrow(x) for name, x in frames.items()})
+    _write_parquet(path / "meta/episodes" / first, _episodes(frames, [len(records) for records in interventions], spec.name))
+    tasks = pd.Index([spec.name], dtype=object, name="task")
+    pd.DataFrame({"task_index": [0]}, index=tasks).to_parquet(path / "meta/tasks.parquet", engine="pyarrow")
     info = {
         "codebase_version": "v3.0",
         "robot_type": spec.name,
-        "total_episodes": count,
-        "total_frames": int(ends[-1]),
+        "total_episodes": len(interventions),
+        "total_frames": len(frames["index"]),
         "total_tasks": 1,
         "chunks_size": 1000,
         "data_files_size_in_mb": 100,
         "video_files_size_in_mb": 200,
         "fps": rate,
-        "splits": {"train": f"0:{count}"},
-        "data_path": data,
+        "splits": {"train": f"0:{len(interventions)}"},
+        "data_path": f"data/{_FILE}",
         "video_path": None,
         "features": {name: _feature(x) for name, x in frames.items()},
     }
-    _write_parquet(path / data.format(chunk_index=0, file_index=0), {name: _arrow(x) for name, x in frames.items()})
-    _write_parquet(path / episodes.format(chunk_index=0, file_index=0), table)
-    tasks = pd.Index([spec.name], dtype=object, name="task")
-    pd.DataFrame({"task_index": [0]}, index=tasks).to_parquet(path / "meta/tasks.parquet", engine="pyarrow")
     for name, content in {"info": info, "stats": _statistics(frames), "fleetjax": _source(config, spec)}.items():
         files.write_json(path / "meta" / f"{name}.json", content)
 
@@ -194,10 +178,26 @@ def _statistics(frames: Mapping[str, np.ndarray]) -> dict[str, dict[str, list[fl
     return {name: {measure: x[i].tolist() for measure, x in parts.items()} for i, name in enumerate(frames)}
 
 
-def _flat(statistics: list[dict[str, dict[str, list[float]]]]) -> dict[str, list[list[float]]]:
-    """Return the columns `stats/FEATURE/MEASURE` of LeRobot's table of episodes."""
+def _episodes(frames: Mapping[str, np.ndarray], lengths: list[int], task: str) -> dict[str, Any]:
+    """Return the columns of LeRobot's table of episodes, that have the given lengths."""
+    ends = np.cumsum(lengths)
+    begins = ends - lengths
+    parts = [{name: x[a:b] for name, x in frames.items()} for a, b in zip(begins, ends, strict=True)]
+    statistics = [_statistics(part) for part in parts]
     kinds = [(feature, measure) for feature, measures in statistics[0].items() for measure in measures]
-    return {f"stats/{feature}/{measure}": [x[feature][measure] for x in statistics] for feature, measure in kinds}
+    first_file = np.zeros_like(ends)
+    return {
+        "episode_index": np.arange(len(lengths)),
+        "tasks": [[task]] * len(lengths),
+        "length": np.array(lengths),
+        "data/chunk_index": first_file,
+        "data/file_index": first_file,
+        "dataset_from_index": begins,
+        "dataset_to_index": ends,
+        **{f"stats/{feature}/{measure}": [x[feature][measure] for x in statistics] for feature, measure in kinds},
+        "meta/episodes/chunk_index": first_file,
+        "meta/episodes/file_index": first_file,
+    }
 
 
 def _arrow(values: np.ndarray) -> Any:
@@ -220,11 +220,12 @@ def _write_robomimic(interventions: list[np.ndarray], config: Config, spec: EnvS
     """Write a file in robomimic's format; flags are 0 or 1."""
     import h5py  # pyright: ignore[reportMissingImports]  an extra
 
-    made_by = {"env_name": spec.name, "type": _GYM, "env_type": _GYM, "env_kwargs": {}}  # its code and its documentation differ
+    # What robomimic documents as `env_type` it reads as `type`.
+    environment = {"env_name": spec.name, "type": _GYM, "env_type": _GYM, "env_kwargs": {}}
     with h5py.File(path, "w") as file:
         data = file.create_group("data")
         data.attrs["total"] = sum(len(records) for records in interventions)
-        data.attrs["env_args"] = json.dumps(made_by)
+        data.attrs["env_args"] = json.dumps(environment)
         data.attrs["fleetjax"] = json.dumps(_source(config, spec))
         for i, records in enumerate(interventions):
             demo = data.create_group(f"demo_{i}")
@@ -256,11 +257,10 @@ def _write_minari(interventions: list[np.ndarray], config: Config, spec: EnvSpec
         )
 
     path.mkdir()
-    actions = (spec.action_size,)
     storage = MinariStorage.new(
         path / "data",
         observation_space=spaces.Box(-np.inf, np.inf, (spec.observation_size,)),
-        action_space=spaces.Discrete(spec.action_size) if spec.discrete else spaces.Box(-1.0, 1.0, actions),
+        action_space=spaces.Discrete(spec.action_size) if spec.discrete else spaces.Box(-1.0, 1.0, (spec.action_size,)),
     )
     fleet = f"{config.num_humans} humans who supervise {config.num_robots} robots"
     storage.update_metadata(

@@ -96,15 +96,11 @@ def test_a_configuration_is_valid_or_its_error_names_a_field(environment, fields
 
 SHAPES = [
     ("cur", {"num_robots": 5, "num_humans": 2}),
-    ("uc", {"num_robots": 7, "num_humans": 7, "ensemble_size": 1}),
-    ("ensemble_dagger", {"num_robots": 3, "num_humans": 1, "gradient_steps": 0}),
-    ("thrifty_dagger", {"num_robots": 6, "num_humans": 3, "critic_capacity": 6}),
-    ("random", {"num_robots": 4, "num_humans": 2, "gradient_steps": 2}),
-    ("constraint", {"num_robots": 8, "num_humans": 3}),
-    ("expert", {"num_robots": 3, "num_humans": 3}),
-    ("r", {"num_robots": 1, "num_humans": 1, "hidden_sizes": (3, 2)}),
+    ("thrifty_dagger", {"num_robots": 6, "num_humans": 6, "critic_capacity": 6, "ensemble_size": 1}),
+    ("random", {"num_robots": 8, "num_humans": 3, "gradient_steps": 2, "hidden_sizes": (3, 2)}),
+    ("constraint", {"num_robots": 1, "num_humans": 1}),
 ]
-T, SETTINGS = 40, 32
+T, SETTINGS = 40, 64
 LARGEST = {  # where a field's own limits allow what takes too long, or more data than there is room for
     "min_teleop_time": 12,
     "hard_reset_time": 12,
@@ -230,7 +226,7 @@ def test_any_value_in_a_configuration_is_read_as_it_is_or_refused(finished, tmp_
     read = folder.to_plain(run.config)[name]
     if name == "human_capacity" and value == 0:  # all that a run can give
         value = needed_human_capacity(run.config)
-    assert read == value or math.isclose(read, value, rel_tol=1e-6)
+    assert read == value or math.isclose(read, value, rel_tol=1e-6, abs_tol=1e-37)
 
 
 @FEW

@@ -139,7 +139,7 @@ def test_a_second_ctrl_c_stops_at_once_and_the_run_goes_on_from_an_older_checkpo
     assert_same(path, whole)
 
 
-@pytest.mark.parametrize("every", [7, 45, 119])
+@pytest.mark.parametrize("every", [45, 119])
 def test_any_chunk_length_and_any_stop_give_the_same_bits(tmp_path, monkeypatch, whole, every):
     path = tmp_path / "stopped"
     with monkeypatch.context() as patch:
@@ -329,7 +329,7 @@ def rows(path: Path) -> int:
 def test_kills_at_random_moments_lose_no_bit(tmp_path, whole, spawn):
     path, rng = tmp_path / "killed", np.random.default_rng(0)
     arguments, resumed = (*RUN, "--output", path, "--checkpoint-every", 10), 0
-    for wanted in (int(rng.integers(1, 40)), 55, 90):
+    for wanted in (int(rng.integers(11, 50)), 80):
         process = spawn(*arguments)
         with contextlib.ExitStack() as stack:
             stack.callback(process.kill)
@@ -342,7 +342,7 @@ def test_kills_at_random_moments_lose_no_bit(tmp_path, whole, spawn):
     process = spawn(*arguments)
     _, said = process.communicate()
     assert process.returncode == 0, said
-    assert resumed + ("going on from" in said) >= 2
+    assert resumed + ("going on from" in said) == 2
     assert_same(path, whole)
 
 
@@ -368,21 +368,26 @@ def test_a_kill_during_a_checkpoint_leaves_the_older_ones(stopped, whole, spawn,
     assert_same(stopped, whole)
 
 
-def test_a_full_disk_during_a_checkpoint_is_told_and_the_older_ones_stay(stopped, whole, spawn):
-    size = largest(newest(stopped)).stat().st_size
-    assert size // 2 > (whole / "metrics.csv").stat().st_size  # else the metrics would fail first
-    process = spawn("run", "--resume", stopped, "--checkpoint-every", 6, largest_file=size // 2)
+def test_a_full_disk_during_a_checkpoint_is_told_and_the_older_ones_stay(tmp_path, monkeypatch, whole, spawn):
+    """Files may grow to a size that the logs need until t = 44, and that is too small for a checkpoint."""
+    path, size = tmp_path / "stopped", (whole / "interventions.bin").stat().st_size * 44 // STEPS
+    with monkeypatch.context() as patch:
+        patch.setattr(operation, "progress", interrupt_after(15))
+        assert run_here(*RUN, "--output", path, "--checkpoint-every", 20) == 130
+    assert steps_of(path) == [20, 30]
+    assert largest(newest(path)).stat().st_size > size > (whole / "metrics.csv").stat().st_size
+    process = spawn("run", "--resume", path, "--checkpoint-every", 6, largest_file=size)
     _, said = process.communicate()
     assert process.returncode == 2
-    assert "fleetjax: the checkpoint at t = 72 could not be written" in said.splitlines()[-1]
+    assert "fleetjax: the checkpoint at t = 36 could not be written" in said.splitlines()[-1]
     assert "Traceback" not in said
-    assert steps_of(stopped) == [60, 66]
-    assert run_here("run", "--resume", stopped) == 0
-    assert_same(stopped, whole)
+    assert steps_of(path) == [20, 30]
+    assert run_here("run", "--resume", path) == 0
+    assert_same(path, whole)
 
 
 def test_a_full_disk_during_the_run_is_told_and_the_run_goes_on_later(stopped, whole, spawn):
-    size = (stopped / "metrics.csv").stat().st_size + 100
+    size = (stopped / "interventions.bin").stat().st_size + 100
     process = spawn("run", "--resume", stopped, "--checkpoint-every", 0, largest_file=size)
     _, said = process.communicate()
     assert process.returncode == 2

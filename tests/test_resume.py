@@ -296,6 +296,25 @@ def test_a_folder_in_use_is_refused(stopped, whole, capsys):
     assert_same(stopped, whole)
 
 
+def test_a_policy_that_diverges_ends_the_run_and_says_when(stopped, capsys):
+    """One member's weights are spoilt in a checkpoint; the run ends behind the next chunk, with its metrics so far."""
+    run = folder.read_run(stopped)
+    identity, shapes = folder.identity(run.config, 3), operation.execution.shapes(run.config, jax.random.key(3))
+    found, _ = checkpoint.restore(stopped, identity, shapes, lambda notes: None)
+    assert found is not None
+    learner = found.state.learner
+    spoilt = learner._replace(params=jax.tree.map(lambda x: x.at[1].set(np.nan), learner.params))
+    writer = checkpoint.Writer(stopped, identity)
+    writer.write(found.state._replace(learner=spoilt), found.notes)
+    writer.wait()
+    assert run_here("run", "--resume", stopped) == 1
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith("fleetjax: not finite from t = 66 on: policy")
+    assert f"Metrics so far are in {stopped}" in line
+    assert len(folder.read_metrics(folder.read_run(stopped)).successes) == 68
+    assert steps_of(stopped) == [60, 66]
+
+
 # Other processes, which can be killed
 
 

@@ -58,7 +58,9 @@ def test_semantic_13_a_reset_costs_five_idle_timesteps_when_help_is_instant():
 
 def test_semantic_14_rohe_is_successes_per_hundred_human_steps_scaled_by_the_team():
     zeros = jnp.zeros(3)
-    metrics = Metrics(*[zeros] * 13)._replace(successes=jnp.array([1, 0, 2]), human_steps=jnp.array([50, 50, 0]))
+    metrics = Metrics(*[zeros] * len(Metrics._fields))._replace(
+        successes=jnp.array([1, 0, 2]), human_steps=jnp.array([50, 50, 0])
+    )
     config = fleetjax.make_config("navigation", num_robots=100, num_humans=10)
     np.testing.assert_allclose(fleetjax.rohe(metrics, config), [0.1 / 1.5, 0.1 / 2, 0.3 / 2], rtol=1e-6)
     np.testing.assert_allclose(fleetjax.rohe(metrics, config, time_unit=1), [0.1 / 51, 0.1 / 101, 0.3 / 101], rtol=1e-6)

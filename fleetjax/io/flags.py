@@ -26,7 +26,7 @@ Interactive fleet learning: N robots, M humans. Who should get help, and what do
   fleetjax evaluate RUN                 the trained policy on its own, nobody teleoperates"""
 _RUN_ABOUT = """\
 Clone demonstrations, then run the fleet while it learns from those who help it. Ends with a table, and a run folder that
-holds config.json, metrics.csv (a row a timestep), figure.png and policy.msgpack."""
+holds config.json, metrics.csv (a row a timestep), figure.png, policy.msgpack and the last two checkpoints."""
 _RUN_NOTE = """\
 Two algorithms have defaults of their own: expert has as many humans as robots; constraint has as many gradient steps before
 the start as others have in all, and the human time of C.U.R. as extra demonstrations. `fleetjax list` explains them."""

@@ -150,11 +150,12 @@ def test_any_chunk_length_and_any_stop_give_the_same_bits(tmp_path, monkeypatch,
     assert_same(path, whole)
 
 
-def test_metrics_behind_the_checkpoint_are_cut_off(stopped, whole):
+def test_metrics_behind_the_checkpoint_are_cut_off(stopped, whole, capsys):
     shutil.rmtree(stopped / checkpoint.FOLDER / "0000000066")
     folder.write_config(folder.read_run(stopped), sealed=False)  # as a kill leaves it
     with (stopped / "metrics.csv").open("a") as file:
         file.write("66,1,2")  # a row that a kill has cut
+    assert f"the run is not finished; go on with it: fleetjax run --resume {stopped}" in refused(capsys, "plot", stopped)
     assert run_here("run", "--resume", stopped) == 0
     assert_same(stopped, whole)
 

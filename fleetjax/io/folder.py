@@ -223,6 +223,7 @@ def _fits(value: Any, kind: type) -> bool:
 def _read_data(run: Run, name: str) -> bytes:
     """Return the content of a data file that is as it was written."""
     data = (run.folder / name).read_bytes()
+    _expect(name in run.digests, f"the run is not finished; go on with it: fleetjax run --resume {run.folder}")
     _expect(run.digests.get(name) == files.digest(data), "its SHA-256 is not that in config.json, so it is damaged")
     return data
 

@@ -113,7 +113,7 @@ def _run_in(run: folder.Run, *, resume: bool, checkpoint_every: int) -> None:
     """Run in a folder that is locked."""
     begun = time.monotonic()
     with _refusing():
-        metrics = folder.read_metrics(run) if resume and folder.is_finished(run) else None
+        metrics = folder.read_finished(run) if resume else None
     if metrics:
         say(f"{run.folder} is finished; there is nothing to go on with")
     else:

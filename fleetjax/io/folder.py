@@ -180,17 +180,20 @@ def read_run(folder: Path) -> Run:
         return Run(folder, _from_plain(content["config"]), seed, content.get("log_interventions") is True, digests)
 
 
-def is_finished(run: Run) -> bool:
-    """Return whether a run has all its timesteps, and the policy that it was to train.
+def read_finished(run: Run) -> Metrics | None:
+    """Read the metrics of a run that has all its timesteps, and the policy that it was to train; None if it has not.
 
     Raises:
         ValueError: if what it has is damaged.
     """
-    if METRICS not in run.digests or len(read_metrics(run).successes) < run.config.num_steps:
-        return False
+    if METRICS not in run.digests:
+        return None
+    metrics = read_metrics(run)
+    if len(metrics.successes) < run.config.num_steps:
+        return None
     if get_algorithm(run.config.algorithm).pretrains:
         read_policy(run)
-    return True
+    return metrics
 
 
 def _from_plain(fields: Mapping[str, Any]) -> Config:

@@ -70,7 +70,7 @@ class Task(BraxEnv):
     def step(self, state: Any, action: jax.Array) -> State:
         """Take one control step; a violation ends the episode."""
         key_next, key_vary, key_step, key_goal = jax.random.split(state.info["key"], 4)
-        before = self.training.vary(state.pipeline_state, key_vary)
+        before = self.stage.vary(state.pipeline_state, key_vary)
         if self.training.step_size:
             action = expert.add_to_last(before.obs, self.training.step_size * jnp.clip(action, -1.0, 1.0))
         after = self.env.step(before, action, jnp.bool_(True), key_step)

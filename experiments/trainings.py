@@ -26,6 +26,7 @@ class Stage(NamedTuple):
         begins: after how many environment steps.
         options: what `Training.make_env` is given.
         noise: standard deviation that actions of a `CLIPPED_NORMAL` policy have at the beginning; None leaves what it was.
+        vary: `(EnvState, key) -> EnvState`, a disturbance before each training step.
     """
 
     settings: dict[str, Any]
@@ -33,6 +34,7 @@ class Stage(NamedTuple):
     begins: int = 0
     options: Mapping[str, Any] = {}
     noise: float | None = None
+    vary: Callable[[EnvState, jax.Array], EnvState] = lambda state, key: state
 
 
 class Training(NamedTuple):
@@ -43,7 +45,6 @@ class Training(NamedTuple):
         success_floor: the return below which no episode succeeds.
         measure: name of what is reported beside the return, and `EnvState -> f32[]`, averaged over steps.
         stages: one after the other.
-        vary: `(EnvState, key) -> EnvState`, a disturbance before each training step.
         hidden_sizes: units of the hidden layers of policy and value network.
         network: what else brax's networks are built with.
         episode_length: of training, in control steps.
@@ -56,7 +57,6 @@ class Training(NamedTuple):
     measure: tuple[str, Callable[[EnvState], jax.Array]]
     episode_length: int
     stages: tuple[Stage, ...]
-    vary: Callable[[EnvState, jax.Array], EnvState] = lambda state, key: state
     hidden_sizes: tuple[int, ...] = (256, 128)
     network: Mapping[str, Any] = {}
     step_size: float | None = None
@@ -93,13 +93,24 @@ def sure_walking(before: EnvState, after: EnvState) -> jax.Array:
     return after.reward - 2e-4 * trembling(before, after) - 1.0 * after.violation
 
 
-def change_command(state: EnvState, key: jax.Array) -> EnvState:
-    """Give ANYmal another command now and then, every 250 steps in the mean; easy ones are more frequent than in the task."""
-    key_when, key_what, key_scale = jax.random.split(key, 3)
+def easy_command(key: jax.Array) -> jax.Array:
+    """Draw a command f32[3] for ANYmal; slow ones are more frequent than in the task."""
+    key_what, key_scale = jax.random.split(key)
     scale = jnp.minimum(1.0, jax.random.uniform(key_scale, maxval=3.0))
-    command = scale * jax.random.uniform(key_what, (3,), minval=-1.0, maxval=1.0) * anymal.COMMAND_RANGE
+    return scale * jax.random.uniform(key_what, (3,), minval=-1.0, maxval=1.0) * anymal.COMMAND_RANGE
+
+
+def hard_command(key: jax.Array) -> jax.Array:
+    """Draw a command f32[3] for ANYmal; fast ones, with turns, are more frequent than in the task."""
+    draw = jax.random.uniform(key, (3,), minval=-1.0, maxval=1.0)
+    return jnp.sign(draw) * jnp.abs(draw) ** 0.4 * anymal.COMMAND_RANGE
+
+
+def change_command(draw: Callable[[jax.Array], jax.Array], state: EnvState, key: jax.Array) -> EnvState:
+    """Give ANYmal another command now and then, every 250 steps in the mean."""
+    key_when, key_what = jax.random.split(key)
     walker = state.physics
-    command = jnp.where(jax.random.uniform(key_when) < 1 / 250, command, walker.command)
+    command = jnp.where(jax.random.uniform(key_when) < 1 / 250, draw(key_what), walker.command)
     walker = walker._replace(command=command)
     return state._replace(physics=walker, obs=anymal.observe(walker, state.obs[36:]))
 
@@ -150,6 +161,8 @@ TURNING = LARGE_BATCHES | {
 }
 SMALL_STEPS = {"learning_rate": 3e-5, "desired_kl": 0.006}
 FINE = {"discounting": 0.99, "reward_scaling": 5.0, "entropy_cost": 0.0}
+EASY = functools.partial(change_command, easy_command)
+HARD = functools.partial(change_command, hard_command)
 # Actions from a normal distribution that the environment clips, of a width that does not depend on the state: a wide one
 # keeps the robot moving until it has found a gait. With brax's default, a normal distribution under tanh, ANYmal learns to
 # stand, and goes on standing.
@@ -179,16 +192,17 @@ TRAININGS = {
         make_env=functools.partial(anymal.make_env, success_return=math.inf),
         success_floor=anymal.SUCCESS_FLOOR,
         measure=("mean_tracking_error", anymal.tracking_error),
-        vary=change_command,
         network=CLIPPED_NORMAL,
         episode_length=1000,
         # The first 6 million steps ran with two iterations of the solver, the rest with the model's ten.
         stages=(
-            Stage(LARGE_BATCHES | {"discounting": 0.98, "reward_scaling": 3.0}, progress),
-            Stage(LARGE_BATCHES | FINE, calm_walking, begins=10_000_000, noise=0.3),
-            Stage(LARGE_BATCHES | FINE | SMALL_STEPS, sure_walking, begins=18_000_000, noise=0.12),
-            Stage(LARGE_BATCHES | FINE | {"desired_kl": 0.01}, sure_walking, begins=25_000_000, noise=0.2),
-            Stage(LARGE_BATCHES | FINE | SMALL_STEPS, sure_walking, begins=32_000_000, noise=0.1),
+            Stage(LARGE_BATCHES | {"discounting": 0.98, "reward_scaling": 3.0}, progress, vary=EASY),
+            Stage(LARGE_BATCHES | FINE, calm_walking, begins=10_000_000, noise=0.3, vary=EASY),
+            Stage(LARGE_BATCHES | FINE | SMALL_STEPS, sure_walking, begins=18_000_000, noise=0.12, vary=EASY),
+            Stage(LARGE_BATCHES | FINE | {"desired_kl": 0.01}, sure_walking, begins=25_000_000, noise=0.2, vary=EASY),
+            Stage(LARGE_BATCHES | FINE | SMALL_STEPS, sure_walking, begins=32_000_000, noise=0.1, vary=EASY),
+            Stage(LARGE_BATCHES | FINE | {"desired_kl": 0.01}, sure_walking, begins=35_500_000, noise=0.2, vary=HARD),
+            Stage(LARGE_BATCHES | FINE | SMALL_STEPS, sure_walking, begins=46_000_000, noise=0.1, vary=HARD),
         ),
     ),
     "humanoid": Training(

@@ -72,8 +72,8 @@ def test_every_shipped_expert_has_its_record(name):
     assert record["environment"] == name
     assert 0 < record["share_full_length"] <= 1
     assert record["mean_return_full_length"] >= record["mean_return"]
-    weights = expert.load_weights(name)
-    assert weights["obs_mean"].shape == (env.spec.observation_size,)
+    weights, view = expert.load_weights(name), TRAININGS[name].view
     supervisor = supervisors.make(name, env)
     state = env.reset(jax.random.key(0), jnp.int32(0))
-    np.testing.assert_array_equal(supervisor.act(state, jax.random.key(0)), expert.policy(weights, state.obs))
+    assert weights["obs_mean"].shape == view(state.obs).shape
+    np.testing.assert_array_equal(supervisor.act(state, jax.random.key(0)), expert.policy(weights, state.obs, view))

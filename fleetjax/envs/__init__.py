@@ -54,6 +54,7 @@ _ENVS: dict[str, _Entry] = {
         _robot("humanoid"), {"uncertainty_threshold": 0.05, "random_threshold": 0.99807, "initial_period": 1000}
     ),
     "anymal": _Entry(_robot("anymal"), {"uncertainty_threshold": 0.05, "initial_period": 250}),
+    "allegro_hand": _Entry(_robot("allegro_hand"), {"uncertainty_threshold": 0.15, "initial_period": 2500}),
     "navigation": _Entry(
         _navigation,
         {

@@ -20,7 +20,7 @@ from fleetjax.types import EnvState
 HORIZON = 600
 SUBSTEPS = 4
 GOAL_POSITION = np.array([0.0, -0.2, 0.52], np.float32)  # m
-SHOWN_AT = np.array([-0.2, -0.26, 0.64], np.float32)  # m, where pictures show the goal
+SHOWN_AT = np.array([-0.16, -0.2, 0.6], np.float32)  # m, where pictures show the goal
 TOLERANCE = 0.1  # rad, within which a goal is reached
 DROP_DISTANCE = 0.24  # m from the goal's position, at which the cube counts as dropped
 STIFFNESS, DAMPING, LARGEST_TORQUE = 3.0, 0.1, 0.5  # N m/rad, N m s/rad, N m

@@ -121,7 +121,7 @@ def _painter(model: mujoco.MjModel, width: int, height: int) -> Iterator[Callabl
     context = _gl_context(width, height)
     context.make_current()
     plain = model.geom_rgba.copy()
-    robot = model.geom_bodyid > 0
+    robot = (model.geom_bodyid > 0) & (model.geom_group == 0)  # group 1: what robots handle
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
     data, scene = mujoco.MjData(model), mujoco.MjvScene(model, maxgeom=model.ngeom + 100)
     target = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)

@@ -27,18 +27,25 @@ def _navigation(env: Env) -> Supervisor:
     return Supervisor(lambda state, key: navigation.teach(state))
 
 
-def _shipped(name: str) -> Callable[[Env], Supervisor]:
+def _shipped(name: str, view: expert.View = expert.everything) -> Callable[[Env], Supervisor]:
     def make_supervisor(env: Env) -> Supervisor:
         del env
         weights = expert.load_weights(name)
-        return Supervisor(lambda state, key: expert.policy(weights, state.obs))
+        return Supervisor(lambda state, key: expert.policy(weights, state.obs, view))
 
     return make_supervisor
+
+
+def _allegro_hand(env: Env) -> Supervisor:
+    from fleetjax.envs import allegro_hand
+
+    return _shipped("allegro_hand", allegro_hand.view)(env)
 
 
 _SUPERVISORS: dict[str, Callable[[Env], Supervisor]] = {
     "humanoid": _shipped("humanoid"),
     "anymal": _shipped("anymal"),
+    "allegro_hand": _allegro_hand,
     "navigation": _navigation,
 }
 

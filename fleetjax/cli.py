@@ -40,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         arguments = flags.parse(sys.argv[1:] if argv is None else argv)
         commands[arguments.command](arguments)
-    except (Refusal, OSError) as error:
+    except (Refusal, operation.Unusable, OSError) as error:
         say(f"fleetjax: {files.one_line(error)}")
         return 2
     except operation.Diverged as error:
@@ -118,8 +118,7 @@ def _run_in(run: folder.Run, *, resume: bool, checkpoint_every: int) -> None:
         say(f"{run.folder} is finished; there is nothing to go on with")
     else:
         folder.write_config(run, sealed=False) if resume else folder.create(run)
-        with _refusing():
-            metrics = _operate(run, resume=resume, checkpoint_every=checkpoint_every)
+        metrics = _operate(run, resume=resume, checkpoint_every=checkpoint_every)
     print(f"\n{text.headline(run.config, run.seed)}\n\n{text.run_table(metrics, run.config)}\n")
     print(f"{text.duration(time.monotonic() - begun)} in all. Run folder: {run.folder}")
 

@@ -56,7 +56,8 @@ class Env(NamedTuple):
         spec: static facts.
         next_goal: `(EnvState, key) -> EnvState` draws a new goal after a success and lets the episode go on;
             None if a success ends the episode.
-        scene: how to draw it; None if there is nothing to see.
+        scene: how to draw its bodies; None if there are none.
+        picture: `EnvState -> u8[H, W, 3]`, what people see of it where there is no scene; None if nothing.
     """
 
     reset: Callable[[jax.Array, jax.Array], EnvState]
@@ -64,6 +65,7 @@ class Env(NamedTuple):
     spec: EnvSpec
     next_goal: Callable[[EnvState, jax.Array], EnvState] | None = None
     scene: Scene | None = None
+    picture: Callable[[EnvState], jax.Array] | None = None
 
 
 def begin(physics: Any, obs: jax.Array) -> EnvState:

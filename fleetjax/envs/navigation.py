@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fleetjax.envs import base
+from fleetjax.envs import base, raster
 from fleetjax.types import EnvState
 
 HORIZON = 250
@@ -24,12 +24,20 @@ DOORS_Y = np.array([0.5, -0.5], np.float32)  # m, centres of their doorways
 DOOR_WIDTH = 0.36  # m
 WALL_THICKNESS = 0.06  # m
 MARGIN = 0.12  # m, between a start or a goal and the nearest wall
+ROBOT_RADIUS, PICTURE_SIZE = 0.05, 192  # m and pixels, in pictures only: the robot is a point
+FLOOR, WALL, GOAL, ROBOT, STUCK = (
+    (238, 236, 230),
+    (70, 74, 84),
+    (96, 180, 110),
+    (40, 90, 200),
+    (210, 50, 40),
+)  # red, green, blue
 
 
 def make_env() -> base.Env:
     """Build the navigation environment: 8 observations (position, velocity, goal, way to the goal), 2 actions."""
     spec = base.EnvSpec("navigation", 8, 2, HORIZON, CONTROL_STEP, has_goal=True, supervisor="navigation")
-    return base.Env(_reset, _step, spec)
+    return base.Env(_reset, _step, spec, picture=draw)
 
 
 def _reset(key: jax.Array, robot: jax.Array) -> EnvState:
@@ -79,6 +87,22 @@ def hits_wall(position: jax.Array) -> jax.Array:
     in_wall = jnp.abs(x - WALLS_X) < WALL_THICKNESS / 2
     in_door = jnp.abs(y - DOORS_Y) < DOOR_WIDTH / 2
     return jnp.any(in_wall & ~in_door) | jnp.any(jnp.abs(position) > 1.0)
+
+
+def draw(state: EnvState) -> jax.Array:
+    """Return the rooms from above u8[192, 192, 3]: walls, the goal (green), the robot (blue, red in violation)."""
+    position, velocity, goal = state.physics[:2], state.physics[2:4], state.physics[4:]
+    points = raster.grid(PICTURE_SIZE)
+    picture = raster.plain(PICTURE_SIZE, FLOOR)
+    for wall, door in zip(WALLS_X, DOORS_Y, strict=True):
+        for low, high in ((-1.0, door - DOOR_WIDTH / 2), (door + DOOR_WIDTH / 2, 1.0)):
+            half = jnp.array([WALL_THICKNESS, high - low]) / 2
+            picture = raster.paint(picture, raster.box(points, jnp.array([wall, (low + high) / 2]), half), WALL)
+    picture = raster.paint(picture, raster.disc(points, goal, GOAL_RADIUS), GOAL)
+    robot, ahead = raster.disc(points, position, ROBOT_RADIUS), position + 0.15 * velocity / TOP_SPEED
+    picture = raster.paint(picture, raster.disc(points, ahead, 0.4 * ROBOT_RADIUS), ROBOT, opacity=0.6)
+    colour = jnp.where(state.violation, jnp.array(STUCK), jnp.array(ROBOT))
+    return raster.as_pixels(raster.paint(picture, robot, colour))
 
 
 def teach(state: EnvState) -> jax.Array:

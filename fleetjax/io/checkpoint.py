@@ -5,7 +5,6 @@ not match it is damaged, and an older one is taken. orbax itself restores flippe
 """
 
 import contextlib
-import hashlib
 import json
 import logging
 import shutil
@@ -206,9 +205,4 @@ def _restored(found: Mapping[str, np.ndarray], name: str, leaf: Any) -> jax.Arra
 def _digests(path: Path) -> dict[str, str]:
     """Return the SHA-256 of every file below a checkpoint's folder but the manifest, by relative name."""
     found = sorted(file for file in path.rglob("*") if file.is_file() and file != path / MANIFEST)
-    return {file.relative_to(path).as_posix(): _digest(file) for file in found}
-
-
-def _digest(file: Path) -> str:
-    with file.open("rb") as content:
-        return hashlib.file_digest(content, "sha256").hexdigest()
+    return {file.relative_to(path).as_posix(): files.digest(file.read_bytes()) for file in found}

@@ -27,6 +27,10 @@ class Diverged(ArithmeticError):
     """Something learnt is not finite any more."""
 
 
+class Unusable(ValueError):
+    """A run cannot be gone on with: its checkpoints are all damaged or foreign."""
+
+
 class Journal:
     """What a run leaves as it goes on: `metrics.csv`, and the log of interventions if there is one.
 
@@ -85,7 +89,7 @@ def operate(run: folder.Run, *, resume: bool, checkpoint_every: int) -> tuple[Me
         Metrics[T] in numpy arrays and the last state.
 
     Raises:
-        ValueError: if there are checkpoints and none can be used.
+        Unusable: if there are checkpoints and none can be used.
         OSError: if something cannot be written.
         Diverged: if what is learnt is not finite any more.
         KeyboardInterrupt: if it was asked to stop; the message says how to go on.
@@ -163,7 +167,7 @@ def _resume(run: folder.Run, key: jax.Array, length: int) -> Start:
         say(f"left out {reason}")
     if found is None:
         if refused:
-            raise ValueError(f"{run.folder} has no checkpoint that could be used; run it anew, with --overwrite")
+            raise Unusable(f"{run.folder} has no checkpoint that could be used; run it anew, with --overwrite")
         say("no checkpoint was written yet; from the start")
         return _begin(run, key, length)
     say(f"going on from {found.path}")

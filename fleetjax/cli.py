@@ -1,4 +1,4 @@
-"""The command line: `fleetjax run`, `list`, `plot`, `evaluate`, `export` and `render`.
+"""The command line: `fleetjax run`, `list`, `plot`, `evaluate`, `export`, `render`, `console` and `replay`.
 
 What cannot be used is refused with one line on stderr and exit code 2, before anything is computed.
 """
@@ -17,6 +17,7 @@ import numpy as np
 
 from fleetjax import envs
 from fleetjax.config import FIELDS, Config, make_config, validate
+from fleetjax.console.replaying import Disagreement
 from fleetjax.envs import get_defaults, list_envs
 from fleetjax.io import execution, export, files, flags, folder, operation, text
 from fleetjax.io.flags import Refusal
@@ -34,16 +35,26 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: arguments; None takes the process's, which Ctrl-C then ends at once.
 
     Returns:
-        int: exit code: 0, 1 for a run that diverged, 2 for input that cannot be used, 130 after Ctrl-C.
+        int: exit code: 0, 1 for a run that diverged or a replay that differs, 2 for input that cannot be used, 130 after
+            Ctrl-C.
     """
-    commands = {"run": _run, "list": _list, "plot": _plot, "evaluate": _evaluate, "export": _export, "render": _render}
+    commands = {
+        "run": _run,
+        "list": _list,
+        "plot": _plot,
+        "evaluate": _evaluate,
+        "export": _export,
+        "render": _render,
+        "console": _console,
+        "replay": _replay,
+    }
     try:
         arguments = flags.parse(sys.argv[1:] if argv is None else argv)
         commands[arguments.command](arguments)
     except (Refusal, operation.Unusable, OSError) as error:
         say(f"fleetjax: {files.one_line(error)}")
         return 2
-    except operation.Diverged as error:
+    except (operation.Diverged, Disagreement) as error:
         say(f"fleetjax: {error}")
         return 1
     except KeyboardInterrupt as interrupt:
@@ -99,6 +110,10 @@ def _to_resume(arguments: argparse.Namespace, given: Mapping[str, Any]) -> folde
     if arguments.output or arguments.overwrite:
         raise ValueError("--resume goes on in the run's own folder; leave out --output and --overwrite")
     run = folder.read_run(arguments.resume)
+    if (run.folder / folder.RECORD).exists():
+        raise ValueError(
+            f"{run.folder} was supervised by people, who are not there any more; only `fleetjax replay` repeats it"
+        )
     if arguments.log_interventions and not run.logged:
         raise ValueError("the run does not log interventions; leave out --log-interventions, or begin another run")
     has = folder.to_plain(run.config) | {"seed": run.seed}
@@ -264,6 +279,41 @@ def _render(arguments: argparse.Namespace) -> None:
     with _refusing():
         files.write(arguments.output, render.encode(pictures, arguments.output, rate=rate))
     print(arguments.output)
+
+
+def _console(arguments: argparse.Namespace) -> None:
+    from fleetjax.console import command
+
+    given = {name: value for name, value in vars(arguments).items() if name in FIELDS}
+    with _refusing():
+        arguments.seed = 0 if arguments.seed is None else arguments.seed
+        run = _to_begin(argparse.Namespace(**vars(arguments), log_interventions=False), given)
+        if arguments.interval is None:
+            arguments.interval = envs.make(run.config.environment, run.config.backend).spec.control_step
+        names = ("host", "port", "token", "interval", "timeout", "wait")
+        command.check(run.config, **{name: getattr(arguments, name) for name in names})
+    folder.check_free(run.folder, overwrite=arguments.overwrite)
+
+    from fleetjax.console import server
+
+    options = server.Options(**{name: getattr(arguments, name) for name in names}, simulated=arguments.fill == "simulated")
+    with contextlib.closing(server.listen(arguments.host, arguments.port)) as listener:
+        run.folder.mkdir(parents=True, exist_ok=True)
+        with files.lock(run.folder):
+            metrics = command.supervise(run, options, listener, lambda metrics: _save(run, metrics))
+    print(f"\n{text.headline(run.config, run.seed)}\n\n{text.run_table(metrics, run.config)}\n")
+    print(f"{text.plural(len(metrics.successes), 'timestep')} recorded. Run folder: {run.folder}")
+
+
+def _replay(arguments: argparse.Namespace) -> None:
+    from fleetjax.console import replaying
+
+    with _refusing():
+        run = folder.read_run(arguments.run)
+        rows = replaying.read_record(run)
+    metrics = replaying.replay(run, rows)
+    compared = " and ".join(replaying.compared(run.config))
+    print(f"{run.folder}: {text.plural(len(metrics.successes), 'timestep')} replayed; {compared} agree to the bit")
 
 
 _EVALUATED = ("successes", "violations", "hard_resets", "idle", "human_steps", "moving", "reward")

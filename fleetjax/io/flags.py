@@ -4,8 +4,9 @@ import argparse
 import difflib
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NoReturn
 
 from fleetjax.config import FIELDS, Config, Field
@@ -16,6 +17,7 @@ from fleetjax.version import VERSION
 
 _LARGEST_SEED = 2**32 - 1  # JAX folds larger ones onto these
 _LARGEST = 2**31 - 1
+PORT = 8765  # that a console serves
 _ABOUT = """\
 Interactive fleet learning: N robots, M humans. Who should get help, and what does the fleet gain?
 
@@ -23,7 +25,8 @@ Interactive fleet learning: N robots, M humans. Who should get help, and what do
   fleetjax run humanoid                 the paper's main experiment, C.U.R. with 100 humanoids
   fleetjax run humanoid --help          every parameter, with its meaning, unit and default
   fleetjax plot runs/humanoid-*         runs in one figure, seeds as mean and band
-  fleetjax evaluate RUN                 the trained policy on its own, nobody teleoperates"""
+  fleetjax evaluate RUN                 the trained policy on its own, nobody teleoperates
+  fleetjax console navigation --humans 2   real people supervise, in their browsers"""
 _RUN_ABOUT = """\
 Clone demonstrations, then run the fleet while it learns from those who help it. Ends with a table, and a run folder that
 holds config.json, metrics.csv (a row a timestep), figure.png, policy.msgpack and the last two checkpoints."""
@@ -67,6 +70,9 @@ _RENDER_ABOUT = """Draw robots as an animation, a grid of tiles. Who is teleoper
 
 expert: the supervisor acts on every robot. robot: the trained policy of a run acts, and nobody teleoperates. mixed: the fleet
 as it runs, from its pre-training on, with humans who come to help."""
+_CONSOLE_ABOUT = """Run a fleet one timestep at a time, with people as supervisors: each opens a page, gets a seat, and helps
+the robot that the algorithm allocates. Ends with a table and a run folder as `fleetjax run` does, and a record of what people
+did, from which `fleetjax replay` makes the run again."""
 
 
 def parse(argv: Sequence[str]) -> argparse.Namespace:
@@ -131,6 +137,9 @@ def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser
         "--output", metavar="FILE", type=Path, default=Path("fleetjax.gif"), help="gif or mp4 [default: fleetjax.gif]"
     )
     render.add_argument("--overwrite", action="store_true", help="replace an existing file")
+    _add_console(commands, environment)
+    replay = commands.add_parser("replay", help="run a console's session again from its record, and compare every bit")
+    replay.add_argument("run", metavar="RUN", type=Path, help="run folder of a console")
     return parser, list(commands.choices)
 
 
@@ -154,13 +163,44 @@ def _add_run(commands: Any, environment: str | None) -> None:
     run.add_argument(
         "--log-interventions", action="store_true", help="log what humans who teleoperate see and do, for `fleetjax export`"
     )
-    parameters = run.add_argument_group(f"parameters{f' (defaults of {environment})' if environment else ''}")
+    _add_parameters(run, environment)
+
+
+def _add_console(commands: Any, environment: str | None) -> None:
+    usage = "fleetjax console ENV --humans M [--host HOST --token TOKEN] [--port N] [--output DIR] [parameters]"
+    console = commands.add_parser(
+        "console", help="let people supervise a fleet in their browsers", usage=usage, description=_CONSOLE_ABOUT
+    )
+    console.add_argument("environment", metavar="ENV", nargs="?", default=argparse.SUPPRESS, help="environment with pictures")
+    console.add_argument("--host", default="127.0.0.1", help="address to serve; others than this machine's own need --token")
+    console.add_argument("--port", metavar="N", type=_integer, default=PORT, help=f"0 = any that is free [default: {PORT}]")
+    console.add_argument("--token", help="what every page then needs, as ?token=TOKEN; 8 or more letters and digits")
+    console.add_argument("--interval", metavar="X", type=_number, help="seconds a timestep [default: the control step]")
+    console.add_argument(
+        "--timeout", metavar="X", type=_number, default=10.0, help="seconds until a lost person's seat is free [default: 10]"
+    )
+    console.add_argument(
+        "--wait", metavar="N", type=_integer, default=1, help="people to wait for before the first timestep [default: 1]"
+    )
+    fills = ("simulated", "empty")
+    console.add_argument(
+        "--fill", choices=fills, default="simulated", help="who plays seats that no person takes [default: simulated]"
+    )
+    console.add_argument("--seed", metavar="N", type=_seed, help="random seed [default: 0]")
+    console.add_argument("--output", metavar="DIR", type=Path, help="run folder [default: a new one below runs/]")
+    console.add_argument("--overwrite", action="store_true", help="replace the run in an existing folder")
+    _add_parameters(console, environment, short={"num_humans": "--humans"})
+
+
+def _add_parameters(command: Any, environment: str | None, short: Mapping[str, str] = MappingProxyType({})) -> None:
+    """Add a flag for each field of `Config`, with a short form for some."""
+    parameters = command.add_argument_group(f"parameters{f' (defaults of {environment})' if environment else ''}")
     for name, field in FIELDS.items():
         if name != "environment":
-            _add_field(parameters, name, field, environment)
+            _add_field(parameters, name, field, environment, *([short[name]] if name in short else []))
 
 
-def _add_field(group: Any, name: str, field: Field, environment: str | None) -> None:
+def _add_field(group: Any, name: str, field: Field, environment: str | None, *short: str) -> None:
     unit = f" ({field.unit})" if field.unit else ""
     options: dict[str, Any] = {"default": argparse.SUPPRESS}
     if field.kind is bool:
@@ -171,7 +211,7 @@ def _add_field(group: Any, name: str, field: Field, environment: str | None) -> 
         kinds = {str: (str, "NAME"), int: (_integer, "N"), float: (_number, "X")}
         options["type"], options["metavar"] = kinds[field.kind]
     text = f"{field.help}{unit} [default: {_default(name, environment)}]".replace("%", "%%")
-    group.add_argument(f"--{name.replace('_', '-')}", help=text, **options)
+    group.add_argument(f"--{name.replace('_', '-')}", *short, help=text, **options)
 
 
 def _default(name: str, environment: str | None) -> str:

@@ -32,7 +32,8 @@ from fleetjax.priority import get_algorithm
 from fleetjax.version import VERSION
 
 CONFIG, METRICS, FIGURE, POLICY, EVALUATION = "config.json", "metrics.csv", "figure.png", "policy.msgpack", "evaluation.json"
-DATA = (METRICS, POLICY, interventions.FILE)
+RECORD = "console.bin"  # what people did, where they supervised the run
+DATA = (METRICS, POLICY, interventions.FILE, RECORD)
 REALS = ("reward", "uncertainty", "policy_loss")  # the metrics that are no counts
 _COLUMNS = ("timestep", *Metrics._fields)
 _LARGEST = 2**31 - 1  # traced integers are i32

@@ -1,0 +1,94 @@
+"""What `fleetjax console` does, behind the command line: checks first, then a session."""
+
+import asyncio
+import importlib.util
+import math
+import socket
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from fleetjax import envs
+from fleetjax.config import Config
+from fleetjax.console import controls
+from fleetjax.io import folder, text
+from fleetjax.io.operation import Diverged
+from fleetjax.io.progress import progress, say
+from fleetjax.metrics import Metrics
+
+if TYPE_CHECKING:  # the rest is imported once it is known to be installed
+    from fleetjax.console.server import Options
+    from fleetjax.console.session import Session
+
+NEEDED = ("starlette", "uvicorn", "websockets")
+
+
+def check(config: Config, *, host: str, port: int, token: str | None, interval: float, timeout: float, wait: int) -> None:
+    """Check all that was asked for before anything is computed.
+
+    Raises:
+        ValueError: if it cannot be used.
+    """
+    controls.controls_of(envs.make(config.environment, config.backend))
+    if any(importlib.util.find_spec(name) is None for name in NEEDED):
+        raise ValueError('the console needs a web server: pip install "fleetjax[console]"')
+    from fleetjax.console import guard
+
+    guard.check_address(host, token)
+    if not 0 <= port <= 65535:
+        raise ValueError(f"port = {port} must be in [0, 65535]; 0 takes any that is free")
+    if not (math.isfinite(interval) and interval >= 0):
+        raise ValueError(f"interval = {interval} must be at least 0 seconds")
+    if not (math.isfinite(timeout) and timeout > 0):
+        raise ValueError(f"timeout = {timeout} must be more than 0 seconds")
+    if not 0 <= wait <= config.num_humans:
+        raise ValueError(f"wait = {wait} must be in [0, {config.num_humans}], the seats that there are")
+
+
+def supervise(run: folder.Run, options: "Options", listener: socket.socket, save: Callable[[Metrics], None]) -> Metrics:
+    """Run a console in a folder that is locked.
+
+    Args:
+        run: the run.
+        options: how it is served.
+        listener: bound socket.
+        save: draws and seals what there is.
+
+    Returns:
+        Metrics[t].
+
+    Raises:
+        Diverged: if something learnt is not finite any more; what there is, is kept.
+        KeyboardInterrupt: if it was stopped before the first timestep; nothing is kept.
+    """
+    from fleetjax.console import server
+    from fleetjax.console.session import Session
+
+    begun = time.monotonic()
+    say(f"{text.headline(run.config, run.seed)}: compiling and preparing ...")
+    folder.create(run)
+    session = None
+    try:
+        session = Session(run)
+        address = server.address_of(listener, options)
+
+        def ready() -> None:
+            say(f"ready after {text.duration(time.monotonic() - begun)}; Ctrl-C ends the session. Open {address}")
+
+        with progress(run.config) as show:
+            asyncio.run(server.Console(session, options).run(listener, ready=ready, show=show))
+    except (KeyboardInterrupt, Diverged):
+        _keep(run, session, save)
+        raise
+    return _keep(run, session, save)
+
+
+def _keep(run: folder.Run, session: "Session | None", save: Callable[[Metrics], None]) -> Metrics:
+    """Keep what there is; remove the folder if that is nothing."""
+    if session is None or not session.metrics:
+        folder.discard(run.folder)
+        raise KeyboardInterrupt("before the first timestep; nothing was kept") from None
+    session.close()
+    metrics = session.joined()
+    save(metrics)
+    return metrics

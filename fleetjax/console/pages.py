@@ -1,0 +1,146 @@
+"""What pages are told, as JSON: the operator's view of one robot, and everybody's view of the fleet."""
+
+import base64
+import io
+import json
+from collections.abc import Collection, Mapping
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from fleetjax.console.controls import controls_of
+from fleetjax.console.engine import EMPTY, PERSON, View
+from fleetjax.console.seats import Seat
+from fleetjax.console.session import Session
+from fleetjax.io import text
+from fleetjax.priority import get_algorithm
+
+POINTS = 120  # of a curve
+TILE = 96  # pixels, of a robot on the fleet's page
+_WHO = ("empty", "person", "simulated")
+
+
+def to_json(content: Mapping[str, Any]) -> str:
+    """Return a message as it is sent."""
+    return json.dumps(content, allow_nan=False, separators=(",", ":"))
+
+
+def introduction(session: Session, interval: float) -> dict[str, Any]:
+    """Return what does not change: names, times, controls."""
+    config, controls = session.config, controls_of(session.env)
+    return {
+        "headline": text.headline(config, session.run.seed),
+        "robots": config.num_robots,
+        "seats": config.num_humans,
+        "steps": config.num_steps,
+        "interval": interval,
+        "verb": controls.verb,
+        "hold": controls.hold,
+        "actions": list(controls.actions),
+        "resetTime": int(config.hard_reset_time),
+    }
+
+
+def draw(session: Session, view: View, own: Collection[int], *, tiles: bool) -> tuple[dict[int, str], dict[int, str]]:
+    """Return pictures as data: large ones of robots that people help, and small ones for the fleet's page.
+
+    Args:
+        session: the run.
+        view: the timestep.
+        own: robots whose large picture is wanted.
+        tiles: whether small ones are wanted.
+    """
+    if not own and not tiles:
+        return {}, {}
+    helped = [int(robot) for robot in view.robot if robot >= 0]
+    others = [i for i in np.argsort(~view.violation, kind="stable").tolist() if i not in helped]
+    robots = np.array([*helped, *others][: session.num_pictures], np.int32)
+    pictures = dict(zip(robots.tolist(), session.engine.pictures(robots), strict=True))
+    large = {robot: _encode(pictures[robot]) for robot in own}
+    return large, {robot: _encode(picture, TILE) for robot, picture in sorted(pictures.items())} if tiles else {}
+
+
+def _encode(picture: np.ndarray, width: int = 0) -> str:
+    """Return a picture u8[H, W, 3] as a data URL, made smaller to about `width`."""
+    image = Image.fromarray(picture)
+    if width and image.width >= 2 * width:
+        image = image.reduce(image.width // width)
+    data = io.BytesIO()
+    image.save(data, "png", compress_level=1)
+    return "data:image/png;base64," + base64.b64encode(data.getvalue()).decode()
+
+
+def operator(session: Session, view: View, number: int, seat: Seat, pictures: Mapping[int, str]) -> dict[str, Any]:
+    """Return what the person in a seat sees at a timestep."""
+    robot = seat.robot
+    content: dict[str, Any] = {"type": "state", "tick": view.timestep, "steps": session.config.num_steps, "robot": robot}
+    if robot < 0:
+        return content | {"mode": "free"}
+    config, done = session.config, int(view.duration[number])
+    needed = int(config.hard_reset_time if seat.resetting else config.min_teleop_time)
+    return content | {
+        "since": seat.since,
+        "mode": "reset" if seat.resetting else "drive",
+        "confirmed": seat.confirmed,
+        "bound": max(0, needed - done),
+        "needed": needed,
+        "why": _why(session, view, robot, bound=done < needed),
+        "signals": _signals(session, view, robot),
+        "picture": pictures.get(robot),
+    }
+
+
+def _signals(session: Session, view: View, robot: int) -> list[dict[str, Any]]:
+    """Return a robot's signals beside their thresholds."""
+    config = session.config
+    critics = get_algorithm(config.algorithm).critics
+    rows: list[tuple[str, float, float | None]] = [
+        ("uncertainty", float(view.uncertainty[robot]), float(config.uncertainty_threshold))
+    ]
+    if "safety" in critics:
+        rows.append(("risk", float(view.risk[robot]), float(config.risk_threshold)))
+    if "goal" in critics:
+        rows.append(("chance of success", float(view.goal[robot]), None))
+    return [{"name": name, "value": value, "threshold": threshold} for name, value, threshold in rows]
+
+
+def _why(session: Session, view: View, robot: int, *, bound: bool) -> str:
+    """Return why a robot has help, in a few words."""
+    if view.violation[robot]:
+        return "in violation: it stands still until a hard reset"
+    above = [s["name"] for s in _signals(session, view, robot) if s["threshold"] is not None and s["value"] >= s["threshold"]]
+    if above:
+        return " and ".join(above) + " above the threshold"
+    return "no signal is above its threshold now; the help still has its shortest time to go" if bound else "its priority"
+
+
+def fleet(session: Session, view: View, kinds: np.ndarray, tiles: Mapping[int, str]) -> dict[str, Any]:
+    """Return what everybody sees of the fleet at a timestep."""
+    helper = {int(robot): seat for seat, robot in enumerate(view.robot) if robot >= 0}
+    robots = [
+        {
+            "violation": bool(view.violation[i]),
+            "helper": helper.get(i, -1),
+            "uncertainty": round(float(view.uncertainty[i]), 4),
+            "risk": round(float(view.risk[i]), 3),
+        }
+        for i in range(session.config.num_robots)
+    ]
+    seats = [
+        {"who": _WHO[kind], "robot": int(robot), "resets": bool(robot >= 0 and view.resetting[robot])}
+        for kind, robot in zip(kinds, view.robot, strict=True)
+    ]
+    places = np.unique(np.linspace(0, len(session.curves) - 1, POINTS).round().astype(int)).tolist()
+    curves = [[round(session.curves[i][panel], 4) for i in places] for panel in range(4)]
+    return {
+        "type": "fleet",
+        "tick": view.timestep,
+        "robots": robots,
+        "seats": seats,
+        "people": int(np.sum(kinds == PERSON)),
+        "empty": int(np.sum(kinds == EMPTY)),
+        "pictures": tiles,
+        "places": places,
+        "curves": curves,
+    }

@@ -1,0 +1,94 @@
+"""A run that people supervise, in its run folder."""
+
+import contextlib
+
+import jax
+import numpy as np
+
+from fleetjax import envs
+from fleetjax.console import record
+from fleetjax.console.engine import Engine, Inputs, View
+from fleetjax.io import execution, folder, text
+from fleetjax.io.operation import Diverged
+from fleetjax.metrics import Metrics, first_divergence
+from fleetjax.priority import get_algorithm
+
+SHOWN = 36  # robots that the fleet's page has pictures of; more if there are more people
+
+
+class Session:
+    """The timesteps of a run, each in two halves, written down as they are completed.
+
+    Args:
+        run: its folder, which this process has locked, and its configuration.
+
+    Attributes:
+        engine: the fleet.
+        metrics: Metrics[1] of each timestep so far.
+        curves: cumulative successes, violations and idle time, and the return on human effort, after each.
+    """
+
+    def __init__(self, run: folder.Run):
+        self.run, self.config = run, run.config
+        self.env = envs.make(run.config.environment, run.config.backend)
+        number = min(run.config.num_robots, max(SHOWN, run.config.num_humans))
+        self.engine = Engine(run.config, jax.random.key(run.seed), self.env, num_pictures=number)
+        self.num_pictures = number
+        self.metrics: list[Metrics] = []
+        self._total = dict.fromkeys(Metrics._fields, 0.0)
+        self.curves = [self._heights()]
+        self._rows = record.row_type(run.config, self.env.spec)
+        self._view: View | None = None
+        self._record, self._table = record.open_record(run.folder), folder.open_metrics(run.folder)
+
+    @property
+    def over(self) -> bool:
+        """Whether every timestep is completed."""
+        return len(self.metrics) >= self.config.num_steps
+
+    def begin(self, kinds: np.ndarray) -> View:
+        """Begin a timestep with who sits in each seat, u8[M]."""
+        self._view = self.engine.plan(kinds)
+        return self._view
+
+    def finish(self, inputs: Inputs) -> Metrics:
+        """Complete the timestep and write it down; return its Metrics[1].
+
+        Raises:
+            OSError: if it cannot be written.
+            Diverged: if what is learnt is not finite any more.
+        """
+        assert self._view is not None
+        view, self._view = self._view, None
+        metrics = as_chunk(self.engine.advance(inputs))
+        record.append(self._record, view, inputs, self._rows)
+        folder.append_metrics(self._table, metrics, view.timestep)
+        self.metrics.append(metrics)
+        self._total = {name: self._total[name] + more for name, more in text.add_up(metrics).items()}
+        self.curves.append(self._heights())
+        found = first_divergence(metrics)
+        if found:
+            raise Diverged(f"not finite from t = {view.timestep} on: {', '.join(found[1])}; a smaller learning_rate may help")
+        return metrics
+
+    def _heights(self) -> tuple[float, float, float, float]:
+        total = self._total
+        return total["successes"], total["violations"], total["idle"], text.rohe_of(total, self.config)
+
+    def joined(self) -> Metrics:
+        """Return Metrics[t] so far."""
+        return execution.join(self.metrics)
+
+    def close(self) -> None:
+        """Put what was written on the disk, and write the policy."""
+        for log in (self._record, self._table):
+            with contextlib.suppress(OSError):
+                log.mark()
+            log.close()
+        if get_algorithm(self.config.algorithm).pretrains:
+            folder.write_policy(self.run.folder, self.engine.state.learner)
+
+
+def as_chunk(metrics: Metrics) -> Metrics:
+    """Return the Metrics[1] of one timestep."""
+    return jax.tree.map(lambda x: np.asarray(x)[None], metrics)

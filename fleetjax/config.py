@@ -61,6 +61,7 @@ class Config:
     hidden_sizes: tuple[int, ...] = _static((256, 256), "units of the hidden layers of policy and critics")
     batch_size: int = _static(256, "samples a gradient step", low=1)
     gradient_steps: int = _static(1, "gradient steps a timestep", low=0)
+    augmented_copies: int = _static(1, "copies kept of each human pair; if more than 1, their images are augmented", low=1)
     human_capacity: int = _static(0, "room for human data; 0 = all that a run can give", "pairs", low=0)
     critic_capacity: int = _static(250_000, "room of the ring of critic data, at least N", "transitions", low=1)
 
@@ -73,7 +74,9 @@ class Config:
     thrifty_weight: float = _traced(0.25, "weight of the chance of failure in `thrifty_dagger`", high=1)
     thrifty_threshold: float = _traced(3.25, "normalised priority of `thrifty_dagger` at or below which it is 0")
     learning_rate: float = _traced(3e-4, "Adam's learning rate, policy and critics")
-    normalize_observations: bool = _traced(True, "scale observations by the demonstrations' mean and deviation")
+    normalize_observations: bool = _traced(
+        True, "scale observations by the demonstrations' mean and deviation (images: always alike)"
+    )
     num_demonstrations: int = _traced(5000, "offline pairs from whole supervisor episodes", "pairs", low=1)
     extra_demonstrations: int = _traced(0, "offline pairs on top (the constraint baseline)", "pairs")
     pretraining_steps: int = _traced(1000, "gradient steps on the demonstrations", "gradient steps")
@@ -164,7 +167,7 @@ def needed_human_capacity(config: Config) -> int:
     offline = (config.num_demonstrations, config.extra_demonstrations)
     if algorithm.pretrains and all(map(_is_concrete, offline)):
         pairs += int(np.max(np.asarray(offline[0]) + np.asarray(offline[1])))
-    return max(pairs, 1)
+    return max(config.augmented_copies * pairs, 1)
 
 
 def make_config(environment: "str | envs.Env", algorithm: str = "cur", **overrides: Any) -> Config:
@@ -235,6 +238,11 @@ def validate(config: Config, env: "envs.Env | None" = None) -> None:
         _check_data(config, algorithm)
     env = env or envs.make(config.environment, config.backend)
     supervisors.check(config.supervisor or env.spec.supervisor)
+    if config.augmented_copies > 1 and not env.spec.image_shape:
+        raise ValueError(
+            f"augmented_copies = {config.augmented_copies} needs images, and environment = {env.spec.name!r} has none; "
+            "leave it at 1"
+        )
     if "goal" in algorithm.critics and not env.spec.has_goal:
         raise ValueError(
             f"algorithm = {config.algorithm!r} needs a goal to learn from, and environment = {env.spec.name!r} has none; "

@@ -169,7 +169,7 @@ def make_fleet(config: Config, env: Env) -> Fleet:
 
         human_data, critic_states = state.human_data, state.critics
         if algorithm.updates:
-            human_data = imitation.append(human_data, imitation.Pair(obs, human_action), given & sound, key_data)
+            human_data = learner.append(human_data, imitation.Pair(obs, human_action), given & sound, key_data)
         steps = critic.Transition(obs, action, stepped.obs, stepped.violation, stepped.success)
         critic_states = {kind: c.append(critic_states[kind], steps, moving & sound) for kind, c in critics.items()}
 

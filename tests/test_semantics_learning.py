@@ -211,7 +211,9 @@ def test_semantic_19_demonstrations_are_whole_episodes_the_last_one_cut():
     config = fleetjax.make_config(env, num_robots=4, num_humans=2, num_demonstrations=8, batch_size=4, hidden_sizes=(1,))
     supervisor = supervisors.make("toy_scripted", env)
     data = imitation.create_data(env.spec, ensemble_size=2, capacity=50)
-    data = quick_jit(lambda data, key: collect_demonstrations(config, env, supervisor, data, key))(data, jax.random.key(0))
+    data = quick_jit(lambda data, key: collect_demonstrations(config, env, supervisor, imitation.append, data, key))(
+        data, jax.random.key(0)
+    )
     assert int(data.pairs.size) == 8
     robot_and_clock = data.pairs.rows.obs[:8, :2].astype(int).tolist()
     assert robot_and_clock == [[0, 0], [0, 1], [0, 2], [1, 0], [1, 1], [2, 0], [2, 1], [2, 2]]

@@ -42,11 +42,12 @@ def _robot(name: str) -> Callable[[str], Env]:
     return make_env
 
 
-def _navigation(backend: str) -> Env:
-    del backend  # pure JAX
-    from fleetjax.envs import navigation
+def _pure(name: str) -> Callable[[str], Env]:
+    def make_env(backend: str) -> Env:
+        del backend  # pure JAX
+        return importlib.import_module(f"fleetjax.envs.{name}").make_env()
 
-    return navigation.make_env()
+    return make_env
 
 
 _ENVS: dict[str, _Entry] = {
@@ -55,8 +56,26 @@ _ENVS: dict[str, _Entry] = {
     ),
     "anymal": _Entry(_robot("anymal"), {"uncertainty_threshold": 0.05, "initial_period": 250}),
     "allegro_hand": _Entry(_robot("allegro_hand"), {"uncertainty_threshold": 0.15, "initial_period": 2500}),
+    "block_push": _Entry(
+        _pure("block_push"),
+        {
+            "num_robots": 4,
+            "num_humans": 2,
+            "num_steps": 250,
+            "min_teleop_time": 3,
+            "hidden_sizes": (128,),
+            "batch_size": 64,
+            "gradient_steps": 2,
+            "uncertainty_threshold": 0.9,
+            "num_demonstrations": 375,
+            "augmented_copies": 10,
+            "critic_capacity": 4000,
+            "num_critic_transitions": 2000,
+            "critic_pretraining_steps": 1000,
+        },
+    ),
     "navigation": _Entry(
-        _navigation,
+        _pure("navigation"),
         {
             "hidden_sizes": (64, 64),
             "num_steps": 2000,

@@ -22,6 +22,8 @@ class EnvSpec(NamedTuple):
         discrete: whether actions are choices rather than vectors in [-1, 1].
         has_goal: whether `success` means that a goal was reached, so that a goal critic can learn from it.
         supervisor: registered name of the supervisor that helps by default.
+        image_shape: height, width and channels if the observation is an image: its pixel values, whole numbers from 0 to
+            255, row by row; None if it is not.
     """
 
     name: str
@@ -32,6 +34,7 @@ class EnvSpec(NamedTuple):
     discrete: bool = False
     has_goal: bool = False
     supervisor: str = ""
+    image_shape: tuple[int, int, int] | None = None
 
 
 class Scene(NamedTuple):

@@ -12,8 +12,8 @@ import optax
 from fleetjax.config import Config
 from fleetjax.envs import EnvSpec
 from fleetjax.learning import buffer
-from fleetjax.learning.imitation import Learner, LearnerState
-from fleetjax.learning.networks import Normalizer, make_mlp
+from fleetjax.learning.imitation import Learner, LearnerState, stored_obs
+from fleetjax.learning.networks import Normalizer, make_network
 from fleetjax.tree import take, where
 
 TWINS = 2
@@ -75,13 +75,13 @@ def make_critic(kind: str, config: Config, spec: EnvSpec, learner: Learner) -> C
     safety = kind == "safety"
     discount = config.risk_discount if safety else config.goal_discount
     pessimistic = jnp.max if safety else jnp.min
-    network = make_mlp(config.hidden_sizes, 1)
+    network = make_network(spec, config.hidden_sizes, 1)
     optimizer = optax.scale_by_adam()
 
     def init(key: jax.Array) -> CriticState:
         inputs = jnp.zeros(spec.observation_size + spec.action_size)
         params = jax.vmap(lambda k: network.init(k, inputs))(jax.random.split(key, TWINS))
-        flag, obs = jnp.zeros((), bool), jnp.zeros(spec.observation_size)
+        flag, obs = jnp.zeros((), bool), stored_obs(spec)
         example = Transition(obs, jnp.zeros(spec.action_size), obs, flag, flag)
         few = max(config.num_robots, config.critic_capacity // 10)
         return CriticState(

@@ -4,6 +4,7 @@ Continuous actions: members regress the action and act with their mean; uncertai
 actions: one classifier; uncertainty is its entropy.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -13,7 +14,8 @@ import optax
 from fleetjax.config import Config
 from fleetjax.envs import EnvSpec
 from fleetjax.learning import buffer
-from fleetjax.learning.networks import Normalizer, make_mlp
+from fleetjax.learning.augmentation import augment
+from fleetjax.learning.networks import Normalizer, make_network
 from fleetjax.tree import take
 
 
@@ -52,17 +54,24 @@ class Learner(NamedTuple):
         predict: `(LearnerState, obs f32[..., O]) -> (action f32[..., A], uncertainty f32[...])`; the uncertainty lies in
             [0, 1] (discrete: entropy in nats).
         update: `(LearnerState, HumanData, key) -> (LearnerState, loss f32[])`, one gradient step.
+        append: `(HumanData, Pair[K], mask bool[K], key) -> HumanData` adds pairs, in `augmented_copies` if so configured.
     """
 
     init: Any
     predict: Any
     update: Any
+    append: Any
 
 
 def create_data(spec: EnvSpec, *, ensemble_size: int, capacity: int) -> HumanData:
     """Return an empty data set."""
-    example = Pair(jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size))
+    example = Pair(stored_obs(spec), jnp.zeros(spec.action_size))
     return HumanData(buffer.create(example, capacity), jnp.zeros((capacity, ensemble_size), jnp.int32))
+
+
+def stored_obs(spec: EnvSpec) -> jax.Array:
+    """Return an observation [O] of the type that buffers keep: pixel values need a byte each."""
+    return jnp.zeros(spec.observation_size, jnp.uint8 if spec.image_shape else jnp.float32)
 
 
 def append(data: HumanData, pairs: Pair, mask: jax.Array, key: jax.Array) -> HumanData:
@@ -76,10 +85,33 @@ def append(data: HumanData, pairs: Pair, mask: jax.Array, key: jax.Array) -> Hum
     return HumanData(grown, index.rows)
 
 
+def append_augmented(
+    data: HumanData, pairs: Pair, mask: jax.Array, key: jax.Array, *, image_shape: tuple[int, int, int], copies: int
+) -> HumanData:
+    """Add pairs as `append` does, each in several copies whose images are augmented.
+
+    Reference: paper, Appendix (physical experiment protocol).
+    """
+
+    def add(data: HumanData, entry: tuple[Pair, jax.Array, jax.Array]) -> tuple[HumanData, None]:
+        (obs, action), wanted, key = entry
+        key_images, key_data = jax.random.split(key)
+
+        def variants() -> jax.Array:
+            keys = jax.random.split(key_images, copies)
+            return jax.vmap(augment, in_axes=(None, 0))(obs.reshape(image_shape), keys).reshape(copies, -1)
+
+        images = jax.lax.cond(wanted, variants, lambda: jnp.zeros((copies, obs.size)))
+        same = Pair(images, jnp.broadcast_to(action, (copies, *action.shape)))
+        return append(data, same, jnp.broadcast_to(wanted, copies), key_data), None
+
+    return jax.lax.scan(add, data, (pairs, mask, jax.random.split(key, mask.shape[0])))[0]
+
+
 def make_learner(config: Config, spec: EnvSpec) -> Learner:
     """Build the ensemble for a configuration and an environment."""
     members = 1 if spec.discrete else config.ensemble_size
-    network = make_mlp(config.hidden_sizes, spec.action_size)
+    network = make_network(spec, config.hidden_sizes, spec.action_size)
     optimizer = optax.scale_by_adam()
 
     def init(key: jax.Array, normalizer: Normalizer) -> LearnerState:
@@ -113,4 +145,7 @@ def make_learner(config: Config, spec: EnvSpec) -> Learner:
         params = jax.tree.map(lambda p, step: p - config.learning_rate * step, state.params, steps)
         return state._replace(params=params, opt_state=opt_state), jnp.mean(losses)
 
-    return Learner(init, predict, update)
+    add = append
+    if spec.image_shape and config.augmented_copies > 1:
+        add = functools.partial(append_augmented, image_shape=spec.image_shape, copies=config.augmented_copies)
+    return Learner(init, predict, update, add)

@@ -7,7 +7,7 @@ from fleetjax import priority, supervisors, tree
 from fleetjax.config import Config
 from fleetjax.envs import Env
 from fleetjax.learning import critic, imitation
-from fleetjax.learning.networks import fit_normalizer
+from fleetjax.learning.networks import fit_normalizer, pixel_normalizer
 from fleetjax.types import EnvState
 
 LANES = 8  # episodes that are demonstrated side by side
@@ -15,9 +15,18 @@ BURST = 20  # timesteps of offline transitions between two looks at their number
 
 
 def collect_demonstrations(
-    config: Config, env: Env, supervisor: supervisors.Supervisor, data: imitation.HumanData, key: jax.Array
+    config: Config, env: Env, supervisor: supervisors.Supervisor, add, data: imitation.HumanData, key: jax.Array
 ) -> imitation.HumanData:
-    """Fill `data` with supervisor actions from whole episodes, the last one cut at the number that is asked for."""
+    """Fill `data` with supervisor actions from whole episodes, the last one cut at the number that is asked for.
+
+    Args:
+        config: configuration.
+        env: environment.
+        supervisor: who demonstrates.
+        add: the learner's `append`.
+        data: what to fill.
+        key: random key.
+    """
     lanes = jnp.arange(LANES)
 
     def step(carry: tuple[EnvState, jax.Array], key: jax.Array):
@@ -40,11 +49,12 @@ def collect_demonstrations(
         _, (pairs, valid) = jax.lax.scan(step, (start, jnp.ones(LANES, bool)), keys)
         # Episode after episode, each in order of time.
         pairs, valid = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]), (pairs, valid))
-        valid &= data.pairs.added + jnp.cumsum(valid) <= wanted
-        return imitation.append(data, pairs, valid, key_data), count + 1
+        valid &= data.pairs.added // config.augmented_copies + jnp.cumsum(valid) <= wanted
+        return add(data, pairs, valid, key_data), count + 1
 
     wanted = config.num_demonstrations + config.extra_demonstrations
-    unfinished = lambda carry: carry[0].pairs.added < jnp.minimum(wanted, config.human_capacity)  # noqa: E731
+    limit = jnp.minimum(wanted * config.augmented_copies, config.human_capacity)
+    unfinished = lambda carry: carry[0].pairs.added < limit  # noqa: E731
     return jax.lax.while_loop(unfinished, episodes, (data, jnp.int32(0)))[0]
 
 
@@ -111,8 +121,11 @@ def pretrain(
 
     data = imitation.create_data(env.spec, ensemble_size=members, capacity=config.human_capacity)
     if algorithm.pretrains:
-        data = collect_demonstrations(config, env, supervisor, data, key_demos)
-    normalizer = fit_normalizer(data.pairs.rows.obs, data.pairs.size, enabled=config.normalize_observations)
+        data = collect_demonstrations(config, env, supervisor, learner.append, data, key_demos)
+    if env.spec.image_shape:
+        normalizer = pixel_normalizer(env.spec.observation_size)
+    else:
+        normalizer = fit_normalizer(data.pairs.rows.obs, data.pairs.size, enabled=config.normalize_observations)
     policy = learner.init(key_init, normalizer)
     if algorithm.pretrains:
         keys = lambda i: jax.random.fold_in(key_policy, i)  # noqa: E731

@@ -27,6 +27,13 @@ def _navigation(env: Env) -> Supervisor:
     return Supervisor(lambda state, key: navigation.teach(state))
 
 
+def _block_push(env: Env) -> Supervisor:
+    del env
+    from fleetjax.envs import block_push
+
+    return Supervisor(block_push.teach)
+
+
 def _shipped(name: str, view: expert.View = expert.everything) -> Callable[[Env], Supervisor]:
     def make_supervisor(env: Env) -> Supervisor:
         del env
@@ -46,6 +53,7 @@ _SUPERVISORS: dict[str, Callable[[Env], Supervisor]] = {
     "humanoid": _shipped("humanoid"),
     "anymal": _shipped("anymal"),
     "allegro_hand": _allegro_hand,
+    "block_push": _block_push,
     "navigation": _navigation,
 }
 

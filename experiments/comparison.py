@@ -1,0 +1,84 @@
+"""What scripts share that compare algorithms: run what is missing, then one table and one figure of all."""
+
+import argparse
+import subprocess
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+import fleetjax
+from fleetjax.config import Config
+from fleetjax.io import figure, files, folder, text
+from fleetjax.metrics import Metrics
+
+COLUMNS = {"successes": "successes", "violations": "violations", "idle": "idle", "human_steps": "human time"}
+Case = tuple[str, str, int]  # environment, algorithm, seed
+
+
+def fits(environment: str, algorithm: str) -> bool:
+    """Return whether an algorithm runs on an environment: some need goals."""
+    try:
+        fleetjax.make_config(environment, algorithm)
+    except ValueError:
+        return False
+    return True
+
+
+def finished(path: Path) -> bool:
+    """Return whether a run folder holds a run of full length."""
+    try:
+        run = folder.read_run(path)
+        return len(folder.read_metrics(run).successes) == run.config.num_steps
+    except (OSError, ValueError):
+        return False
+
+
+def run_missing(cases: Iterable[Case], output: Path) -> list[tuple[Config, int, Metrics]]:
+    """Run the cases that are not finished yet, one after the other; return the configuration, seed and metrics of all.
+
+    Raises:
+        subprocess.CalledProcessError: if a run fails.
+    """
+    paths = {case: output / "-".join(map(str, case)) for case in cases}
+    for (environment, algorithm, seed), path in paths.items():
+        if not finished(path):
+            command = [sys.executable, "-m", "fleetjax", "run", environment, "--algorithm", algorithm]
+            subprocess.run([*command, "--seed", str(seed), "--output", path, "--overwrite"], check=True)
+    runs = [folder.read_run(path) for path in paths.values()]
+    return [(run.config, run.seed, folder.read_metrics(run)) for run in runs]
+
+
+def table(data: list[tuple[Config, int, Metrics]]) -> str:
+    """Return a Markdown table, a row for each environment and algorithm: means over seeds, and their deviation if several."""
+    head = f"| environment | algorithm | {' | '.join(COLUMNS.values())} | ROHE |\n|---|---|{(len(COLUMNS) + 1) * '---:|'}"
+    rows = [head]
+    for environment, algorithm in dict.fromkeys((config.environment, config.algorithm) for config, _, _ in data):
+        seeds = [(c, text.add_up(m)) for c, _, m in data if (c.environment, c.algorithm) == (environment, algorithm)]
+        cells = [_shown([total[name] for _, total in seeds], 0) for name in COLUMNS]
+        cells.append(_shown([text.rohe_of(total, config) for config, total in seeds], 3))
+        rows.append("| " + " | ".join([environment, text.label(algorithm), *cells]) + " |")
+    return "\n".join(rows)
+
+
+def _shown(values: list[float], digits: int) -> str:
+    mean = f"{np.mean(values):,.{digits}f}"
+    return f"{mean} ± {np.std(values, ddof=1):,.{digits}f}" if len(values) > 1 else mean
+
+
+def show(data: list[tuple[Config, int, Metrics]], picture: Path) -> None:
+    """Print the table, and draw the figure of all but the expert, whose curves would flatten the others."""
+    print(table(data))
+    shown = [entry for entry in data if entry[0].algorithm != "expert"]
+    files.write(picture, figure.render(figure.draw(figure.group(shown))))
+    print(f"\n{picture}")
+
+
+def make_parser(about: str | None, *, output: Path, seeds: list[int], algorithms: Iterable[str]) -> argparse.ArgumentParser:
+    """Return a parser of what such scripts can be told, with these defaults."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--algorithms", nargs="+", choices=fleetjax.list_algorithms(), default=list(algorithms))
+    parser.add_argument("--seeds", type=int, nargs="+", default=seeds)
+    parser.add_argument("--output", type=Path, default=output)
+    return parser

@@ -1,6 +1,7 @@
 """What `fleetjax console` does, behind the command line: checks first, then a session."""
 
 import asyncio
+import contextlib
 import importlib.util
 import math
 import socket
@@ -18,7 +19,6 @@ from fleetjax.metrics import Metrics
 
 if TYPE_CHECKING:  # the rest is imported once it is known to be installed
     from fleetjax.console.server import Options
-    from fleetjax.console.session import Session
 
 NEEDED = ("starlette", "uvicorn", "websockets")
 
@@ -67,28 +67,32 @@ def supervise(run: folder.Run, options: "Options", listener: socket.socket, save
     begun = time.monotonic()
     say(f"{text.headline(run.config, run.seed)}: compiling and preparing ...")
     folder.create(run)
-    session = None
     try:
         session = Session(run)
+    except KeyboardInterrupt:
+        raise _nothing_kept(run) from None
+
+    def ready() -> None:
         address = server.address_of(listener, options)
+        say(f"ready after {text.duration(time.monotonic() - begun)}; Ctrl-C ends the session. Open {address}")
 
-        def ready() -> None:
-            say(f"ready after {text.duration(time.monotonic() - begun)}; Ctrl-C ends the session. Open {address}")
-
-        with progress(run.config) as show:
-            asyncio.run(server.Console(session, options).run(listener, ready=ready, show=show))
-    except (KeyboardInterrupt, Diverged):
-        _keep(run, session, save)
-        raise
-    return _keep(run, session, save)
-
-
-def _keep(run: folder.Run, session: "Session | None", save: Callable[[Metrics], None]) -> Metrics:
-    """Keep what there is; remove the folder if that is nothing."""
-    if session is None or not session.metrics:
-        folder.discard(run.folder)
-        raise KeyboardInterrupt("before the first timestep; nothing was kept") from None
-    session.close()
-    metrics = session.joined()
-    save(metrics)
+    with contextlib.closing(session):
+        try:
+            with progress(run.config) as show:
+                asyncio.run(server.Console(session, options).run(listener, ready=ready, show=show))
+        except (KeyboardInterrupt, Diverged):
+            if not session.metrics:
+                raise _nothing_kept(run) from None
+            save(session.complete())
+            raise
+        if not session.metrics:
+            raise _nothing_kept(run)
+        metrics = session.complete()
+        save(metrics)
     return metrics
+
+
+def _nothing_kept(run: folder.Run) -> KeyboardInterrupt:
+    """Remove the folder of a session without timesteps; return what to raise."""
+    folder.discard(run.folder)
+    return KeyboardInterrupt("before the first timestep; nothing was kept")

@@ -86,10 +86,12 @@ class Client:
         self.closing = (code, reason)
         self._wake.set()
 
-    @property
-    def idle(self) -> bool:
-        """Whether nothing is left to be sent."""
-        return not self.notices and self.state is None
+    def _next(self) -> str | None:
+        """Take what is to be sent next."""
+        if self.notices:
+            return self.notices.popleft()
+        state, self.state = self.state, None
+        return state
 
     async def deliver(self, socket: WebSocket) -> None:
         """Send what is left here, until the connection ends."""
@@ -97,11 +99,8 @@ class Client:
             while True:
                 await self._wake.wait()
                 self._wake.clear()
-                while not self.idle:
-                    text = self.notices.popleft() if self.notices else self.state
-                    if text is self.state:
-                        self.state = None
-                    await socket.send_text(text or "")
+                while (text := self._next()) is not None:
+                    await socket.send_text(text)
                 if self.closing:
                     await socket.close(*self.closing)
                     return
@@ -237,6 +236,7 @@ class Console:
             ws_ping_timeout=max(1.0, self.options.timeout),
             ws_per_message_deflate=False,
             lifespan="off",
+            log_config=None,
             log_level="critical",
             access_log=False,
             server_header=False,
@@ -309,19 +309,17 @@ class Console:
     async def _publish(self, view: View, kinds: Any, in_worker: Callable[..., Any]) -> None:
         """Leave every page what it is to see of a timestep."""
         session = self.session
-        seated = {client: number for client in self.clients if (number := self.seats.of(client)) is not None}
         watched = any(client.kind == "fleet" for client in self.clients)
-        own = {self.seats.seats[number].robot for number in seated.values()} - {-1}
+        own = {seat.robot for seat in self.seats.seats if seat.client} - {-1}
         large, tiles = await in_worker(lambda: pages.draw(session, view, own, tiles=watched))
         everybody = pages.to_json(pages.fleet(session, view, kinds, tiles)) if watched else ""
         for client in self.clients:
             client.heard = 0
-            number = self.seats.of(client)
-            if client.kind == "fleet":
+            if client.kind == "fleet" and everybody:
                 client.show(everybody)
-            elif number is not None:
-                seat = self.seats.seats[number]
-                client.show(pages.to_json(pages.operator(session, view, number, seat, large)))
+        for number, seat in enumerate(self.seats.seats):
+            if isinstance(seat.client, Client):
+                seat.client.show(pages.to_json(pages.operator(session, view, number, seat, large)))
 
     async def _say_goodbye(self) -> None:
         """Tell every page that it is over, and give them a moment to hear it."""

@@ -1,7 +1,5 @@
 """A run that people supervise, in its run folder."""
 
-import contextlib
-
 import jax
 import numpy as np
 
@@ -75,18 +73,18 @@ class Session:
         total = self._total
         return total["successes"], total["violations"], total["idle"], text.rohe_of(total, self.config)
 
-    def joined(self) -> Metrics:
-        """Return Metrics[t] so far."""
+    def complete(self) -> Metrics:
+        """Put what was written on the disk, and the policy beside it; return the Metrics[t]."""
+        for log in (self._record, self._table):
+            log.mark()
+        if get_algorithm(self.config.algorithm).pretrains:
+            folder.write_policy(self.run.folder, self.engine.state.learner)
         return execution.join(self.metrics)
 
     def close(self) -> None:
-        """Put what was written on the disk, and write the policy."""
+        """Close the files."""
         for log in (self._record, self._table):
-            with contextlib.suppress(OSError):
-                log.mark()
             log.close()
-        if get_algorithm(self.config.algorithm).pretrains:
-            folder.write_policy(self.run.folder, self.engine.state.learner)
 
 
 def as_chunk(metrics: Metrics) -> Metrics:

@@ -90,18 +90,19 @@ function say(text) {
 }
 
 function idle() {
-  held.clear();
+  letGo();
   show({ mode: "free", robot: -1 });
 }
 
 function update(message) {
   const sameHelp = message.robot === state.robot && message.since === state.since;
-  if (!sameHelp) held.clear(); // what is held was meant for another robot
+  if (!sameHelp) letGo(); // what is held was meant for another robot
+  for (const button of buttons.values()) button.classList.remove("sent");
   show(message);
   if (message.mode === "free") say("Not your turn: no robot needs you now.");
   else if (message.mode === "drive") say(`Your turn: ${facts.verb} robot ${message.robot}.`);
   else if (message.confirmed) say(`Robot ${message.robot} is being reset.`);
-  else say(`Your turn: robot ${message.robot} is stuck. Press R to reset it.`);
+  else say(`Your turn: robot ${message.robot} is stuck. Reset it: press R, or the red button.`);
   if (facts.hold && held.size) act();
   else send({ type: "seen" });
 }
@@ -130,25 +131,27 @@ function boundText(message) {
   return message.confirmed ? `${time(message.bound)} until it is reset` : `until you press R, then ${time(message.bound)}`;
 }
 
+/** Show each signal on a scale whose middle is its threshold, or 0 to 1 if it has none. */
 function showSignals(signals) {
   const box = byId("signals");
   while (box.children.length > signals.length) box.lastChild.remove();
   while (box.children.length < signals.length) {
     const row = make("div", "", { class: "signal" });
-    row.append(make("span"), make("meter", "", { min: 0 }), make("output"));
+    row.append(make("span"), make("div", "", { class: "scale" }), make("output"));
+    row.children[1].append(make("meter", "", { min: 0, max: 1 }));
     box.append(row);
   }
   signals.forEach((signal, i) => {
-    const [name, meter, output] = box.children[i].children;
+    const row = box.children[i];
     const limit = signal.threshold;
-    write(name, signal.name);
+    const meter = row.querySelector("meter");
+    write(row.firstChild, signal.name);
     meter.setAttribute("aria-label", signal.name);
-    meter.max = Math.max(1e-6, signal.value, limit === null ? 1 : 2 * limit);
-    if (limit !== null) [meter.low, meter.high, meter.optimum] = [limit, limit, 0];
-    meter.value = signal.value;
+    meter.value = limit === null ? signal.value : Math.min(1, signal.value / (2 * limit || 1e-9));
     const text = signal.value.toPrecision(2);
-    write(output, limit === null ? text : `${text}, threshold ${Number(limit.toPrecision(3))}`);
-    box.children[i].classList.toggle("above", limit !== null && signal.value >= limit);
+    write(row.lastChild, limit === null ? text : `${text}, threshold ${Number(limit.toPrecision(3))}`);
+    row.classList.toggle("limited", limit !== null);
+    row.classList.toggle("above", limit !== null && signal.value >= limit);
   });
 }
 
@@ -157,6 +160,8 @@ function showSignals(signals) {
 function act(names = [...new Set(held.values())]) {
   if (state.mode !== "drive" || !names.length) return;
   send({ type: "act", robot: state.robot, since: state.since, tick: state.tick, held: names });
+  if (facts.hold) return;
+  for (const [name, button] of buttons) button.classList.toggle("sent", names.includes(name)); // the last press counts
 }
 
 function press(holder, name) {
@@ -164,15 +169,20 @@ function press(holder, name) {
   if (facts.hold) {
     held.set(holder, name);
     act();
+    buttons.get(name)?.classList.add("down");
   } else {
     act([name]);
   }
-  buttons.get(name)?.classList.add("down");
 }
 
 function release(holder, name) {
   held.delete(holder);
   buttons.get(name)?.classList.remove("down");
+}
+
+function letGo() {
+  held.clear();
+  for (const button of buttons.values()) button.classList.remove("down", "sent");
 }
 
 function reset() {
@@ -199,7 +209,7 @@ function layPad() {
   }));
   write(byId("hint"), facts.hold
     ? "Hold arrow keys or W A S D; the space bar brakes. While you hold nothing, the robot acts by itself."
-    : "Arrow keys or W A S D: one press is one push. While you press nothing, the robot acts by itself.");
+    : "Arrow keys or W A S D: one push a timestep, and the last press counts. While you press nothing, the robot acts by itself.");
 }
 
 addEventListener("keydown", (event) => {
@@ -211,8 +221,6 @@ addEventListener("keydown", (event) => {
   if (!event.repeat) press(event.code, name);
 });
 addEventListener("keyup", (event) => release(event.code, KEYS[event.code]));
-addEventListener("blur", () => {
-  for (const [holder, name] of [...held]) release(holder, name);
-});
+addEventListener("blur", letGo);
 byId("reset").onclick = reset;
 byId("leave").onclick = () => send({ type: "leave" });

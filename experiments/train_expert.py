@@ -204,19 +204,21 @@ def train_stage(task: Task, folder: Path, *, num_timesteps: int, evaluate_every:
     )
 
 
-def as_weights(params, step_size: float | None = None) -> dict[str, np.ndarray]:
+def as_weights(params, training: Training) -> dict[str, np.ndarray]:
     """Turn brax parameters into the arrays that the package ships (see `fleetjax.supervisors.expert`)."""
     statistics, policy, _ = params
     modules = policy["params"]
     clipped = "MLP_0" in modules
     layers = [layer for _, layer in sorted((modules["MLP_0"] if clipped else modules).items())]
     layers = [*layers, modules["Dense_0"]] if clipped else layers
-    weights: dict[str, Any] = {"obs_mean": statistics.mean, "obs_std": statistics.std}
+    gains = np.ones(statistics.mean.shape, np.float32)
+    gains[list(training.gains)] = list(training.gains.values())
+    weights: dict[str, Any] = {"obs_mean": statistics.mean / gains, "obs_std": statistics.std / gains}
     for i, layer in enumerate(layers):
         actions = layer["bias"].size // 2 if layer is layers[-1] and not clipped else None  # the other half are their scales
         weights[f"kernel_{i}"], weights[f"bias_{i}"] = layer["kernel"][:, :actions], layer["bias"][:actions]
     weights |= {"bound": np.float32(1.0)} if clipped else {}
-    weights |= {"step_size": np.float32(step_size)} if step_size else {}
+    weights |= {"step_size": np.float32(training.step_size)} if training.step_size else {}
     return {name: np.asarray(value) for name, value in weights.items()}
 
 
@@ -234,7 +236,7 @@ def ship(name: str, folder: Path, *, candidates: int, num_episodes: int) -> None
     ranked = sorted(finished, key=lambda path: -curve.get(steps_of(path), -np.inf))
     best = None
     for path in ranked[:candidates]:
-        weights = as_weights(serialization.from_bytes(template(task), path.read_bytes()), training.step_size)
+        weights = as_weights(serialization.from_bytes(template(task), path.read_bytes()), training)
         score = jax.jit(
             lambda w, key: expert.score(task.env, w, measure, num_episodes=num_episodes, key=key, view=training.view)
         )

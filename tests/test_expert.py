@@ -36,10 +36,14 @@ def test_weights_act_as_brax_does(name):
     action = np.clip(policy(obs, jax.random.key(0))[0], -1, 1)
     if training.step_size:
         action = np.clip(np.asarray(obs)[:, -3:] + training.step_size * action, -1, 1)
-    weights = train_expert.as_weights(params, training.step_size)
+    weights = train_expert.as_weights(params, training._replace(gains={}))
     np.testing.assert_allclose(expert.policy(weights, obs), action, atol=2e-5)
     np.testing.assert_allclose(expert.policy(weights, obs[7]), action[7], atol=2e-5)
     assert np.std(action) > 0.1
+    seen = obs * np.array([1, 1, 0.5, 1, 1, 1, 1, 2, 1, 1, 1])
+    gained = train_expert.as_weights(params, training._replace(gains={7: 2.0, 2: 0.5}, step_size=None))
+    plain = train_expert.as_weights(params, training._replace(gains={}, step_size=None))
+    np.testing.assert_allclose(expert.policy(gained, obs), expert.policy(plain, seen), atol=2e-5)
 
 
 def test_a_stage_sets_the_noise_and_nothing_else():

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import json
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from http.client import HTTPConnection, HTTPResponse
 from pathlib import Path
 from typing import Any
@@ -47,11 +47,11 @@ def flags(**changes: Any) -> list[str]:
     return words
 
 
-def compile_once(config: fleetjax.Config, env: envs.Env, num_pictures: int) -> engine.Programs:
+def compile_once(config: fleetjax.Config, env: envs.Env, num_pictures: Sequence[int]) -> engine.Programs:
     """Return the programs of a console; those of another with the same static fields and pictures, if there was one."""
-    key = (jax.tree.structure(config), env.spec.name, num_pictures)
+    key = (jax.tree.structure(config), env.spec.name, tuple(num_pictures))
     if key not in _compiled:
-        if num_pictures == 0:  # a replay takes the session's programs, without the pictures
+        if not num_pictures:  # a replay takes the session's programs, without the pictures
             for (structure, name, _), programs in _compiled.items():
                 if (structure, name) == key[:2]:
                     return programs

@@ -33,7 +33,7 @@ def quick_compilation(monkeypatch):
 
 def make_engine(**changes) -> Engine:
     config = make_config(**changes)
-    return Engine(config, jax.random.key(0), envs.make("navigation"), num_pictures=4)
+    return Engine(config, jax.random.key(0), envs.make("navigation"), num_pictures=[1, 4])
 
 
 def inputs(kind: int, *, given=NOBODY, action=STILL, confirmed=NOBODY) -> Inputs:
@@ -133,7 +133,8 @@ def test_nothing_is_compiled_after_the_start(tmp_path, caplog):
     with contextlib.closing(session), jax.log_compiles(), caplog.at_level(logging.WARNING):
         for kind in (EMPTY, PERSON, SIMULATED):
             session.begin(np.full(2, kind, np.uint8))
-            session.engine.pictures(np.arange(4, dtype=np.int32))
+            for number in (1, 4):
+                session.engine.pictures(session.engine.state.env, np.arange(number, dtype=np.int32))
             session.finish(inputs(kind))
         assert not [line.getMessage() for line in caplog.records if "ompil" in line.getMessage()]
         jax.jit(lambda x: x + 17)(np.ones(3))

@@ -3,6 +3,7 @@
 The logic is `fleetjax.fleet`'s. What people gave comes in as plain arrays, so that a record of it gives the same run again.
 """
 
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ from fleetjax.envs import Env
 from fleetjax.fleet import FleetState, Plan, make_fleet
 from fleetjax.metrics import Metrics
 from fleetjax.run import prepare
+from fleetjax.types import EnvState
 
 EMPTY, PERSON, SIMULATED = 0, 1, 2  # who sits in a seat
 
@@ -75,22 +77,22 @@ class Programs(NamedTuple):
         prepare: `(Config, key) -> FleetState`.
         plan: `(Config, key of all timesteps, FleetState, seat u8[M]) -> (priority's memory, Plan)`.
         advance: `(Config, key of all timesteps, store, rest, Plan, Inputs) -> (FleetState, Metrics)`; see `_split`.
-        draw: `(EnvState[N], robots i32[K]) -> u8[K, H, W, 3]`; None if K = 0.
+        draw: `(EnvState[N], robots i32[K]) -> u8[K, H, W, 3]`, by K.
     """
 
     prepare: Any
     plan: Any
     advance: Any
-    draw: Any
+    draw: Mapping[int, Any]
 
 
-def compile_programs(config: Config, env: Env, num_pictures: int) -> Programs:
+def compile_programs(config: Config, env: Env, num_pictures: Sequence[int]) -> Programs:
     """Compile what a console needs; nothing is compiled later.
 
     Args:
         config: configuration; its traced fields are arguments of the programs.
         env: the environment.
-        num_pictures: robots that are drawn at once; 0 = none.
+        num_pictures: numbers of robots that are drawn at once.
     """
     key = jax.random.key(0)
     start, nothing = jax.eval_shape(prepare, config, key), no_inputs(config, env.spec.action_size)
@@ -103,14 +105,13 @@ def compile_programs(config: Config, env: Env, num_pictures: int) -> Programs:
         advancing = pool.submit(
             lambda: jax.jit(advance, donate_argnums=2).lower(config, key, store, rest, planned, nothing).compile()
         )
-        drawing = pool.submit(lambda: _compile_pictures(env, start, num_pictures))
+        drawing = pool.submit(lambda: {number: _compile_pictures(env, start, number) for number in num_pictures})
         return Programs(preparing.result(), planning.result(), advancing.result(), drawing.result())
 
 
 def _compile_pictures(env: Env, start: FleetState, number: int) -> Any:
     draw = env.picture
-    if not number or draw is None:
-        return None
+    assert draw is not None
     program = jax.jit(lambda env, robots: jax.vmap(draw)(jax.tree.map(lambda x: x[robots], env)))
     return program.lower(start.env, np.zeros(number, np.int32)).compile()
 
@@ -122,13 +123,13 @@ class Engine:
         config: configuration, validated.
         key: random key of the run.
         env: the environment.
-        num_pictures: robots that `pictures` draws at once; 0 = none.
+        num_pictures: numbers of robots that `pictures` may be asked for.
 
     Attributes:
         state: FleetState at the start of the timestep.
     """
 
-    def __init__(self, config: Config, key: jax.Array, env: Env, *, num_pictures: int = 0):
+    def __init__(self, config: Config, key: jax.Array, env: Env, *, num_pictures: Sequence[int] = ()):
         self.config = config
         pool = ThreadPoolExecutor(1)  # this thread only waits: an interrupt within JAX's own code could get lost
         try:
@@ -169,9 +170,9 @@ class Engine:
         self._planned = None
         return jax.device_get(metrics)
 
-    def pictures(self, robots: np.ndarray) -> np.ndarray:
-        """Return u8[K, H, W, 3], what robots i32[K] look like; K is `num_pictures`."""
-        return np.asarray(self._programs.draw(self.state.env, robots))
+    def pictures(self, env: EnvState, robots: np.ndarray) -> np.ndarray:
+        """Return u8[K, H, W, 3], what robots i32[K] look like in EnvState[N]; K is one of `num_pictures`."""
+        return np.asarray(self._programs.draw[len(robots)](env, robots))
 
 
 def _split(state: FleetState) -> tuple[Any, FleetState]:

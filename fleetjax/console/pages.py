@@ -15,6 +15,7 @@ from fleetjax.console.seats import Seat
 from fleetjax.console.session import Session
 from fleetjax.io import text
 from fleetjax.priority import get_algorithm
+from fleetjax.types import EnvState
 
 POINTS = 120  # of a curve
 TILE = 96  # pixels, of a robot on the fleet's page
@@ -42,23 +43,26 @@ def introduction(session: Session, interval: float) -> dict[str, Any]:
     }
 
 
-def draw(session: Session, view: View, own: Collection[int], *, tiles: bool) -> tuple[dict[int, str], dict[int, str]]:
-    """Return pictures as data: large ones of robots that people help, and small ones for the fleet's page.
+def portraits(session: Session, robots: Collection[int]) -> dict[int, str]:
+    """Return large pictures of robots, as data."""
+    env, engine = session.engine.state.env, session.engine
+    return {robot: _encode(engine.pictures(env, np.array([robot], np.int32))[0]) for robot in robots}
+
+
+def tiles(session: Session, env: EnvState, view: View) -> dict[int, str]:
+    """Return small pictures for the fleet's page, as data: of robots that have help, then in violation, then others.
 
     Args:
         session: the run.
+        env: EnvState[N] at the timestep.
         view: the timestep.
-        own: robots whose large picture is wanted.
-        tiles: whether small ones are wanted.
     """
-    if not own and not tiles:
-        return {}, {}
     helped = [int(robot) for robot in view.robot if robot >= 0]
     others = [i for i in np.argsort(~view.violation, kind="stable").tolist() if i not in helped]
-    robots = np.array([*helped, *others][: session.num_pictures], np.int32)
-    pictures = dict(zip(robots.tolist(), session.engine.pictures(robots), strict=True))
-    large = {robot: _encode(pictures[robot]) for robot in own}
-    return large, {robot: _encode(picture, TILE) for robot, picture in sorted(pictures.items())} if tiles else {}
+    robots = np.array([*helped, *others][: session.num_tiles], np.int32)
+    return {
+        int(robot): _encode(picture, TILE) for robot, picture in zip(robots, session.engine.pictures(env, robots), strict=True)
+    }
 
 
 def _encode(picture: np.ndarray, width: int = 0) -> str:
@@ -115,7 +119,7 @@ def _why(session: Session, view: View, robot: int, *, bound: bool) -> str:
     return "no signal is above its threshold now; the help still has its shortest time to go" if bound else "its priority"
 
 
-def fleet(session: Session, view: View, kinds: np.ndarray, tiles: Mapping[int, str]) -> dict[str, Any]:
+def fleet(session: Session, view: View, kinds: np.ndarray, pictures: Mapping[int, str]) -> dict[str, Any]:
     """Return what everybody sees of the fleet at a timestep."""
     helper = {int(robot): seat for seat, robot in enumerate(view.robot) if robot >= 0}
     robots = [
@@ -140,7 +144,7 @@ def fleet(session: Session, view: View, kinds: np.ndarray, tiles: Mapping[int, s
         "seats": seats,
         "people": int(np.sum(kinds == PERSON)),
         "empty": int(np.sum(kinds == EMPTY)),
-        "pictures": tiles,
+        "pictures": pictures,
         "places": places,
         "curves": curves,
     }

@@ -15,6 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
@@ -30,11 +31,13 @@ from fleetjax.console.guard import Guard
 from fleetjax.console.seats import Refused, Seats
 from fleetjax.console.session import Session
 from fleetjax.metrics import Metrics
+from fleetjax.types import EnvState
 
 STATIC = Path(__file__).parent / "static"
 MOST_CLIENTS = 1000
 MOST_MESSAGES = 200  # of one client in a timestep
 MOST_ERRORS = 20  # of one client
+BETWEEN_PAINTINGS = 0.2  # seconds, at least, between two pictures of the fleet
 GOODBYE = 1.0  # seconds that clients get for the last message
 
 
@@ -121,6 +124,8 @@ class Console:
         self.tick = 0
         self._introduction = pages.introduction(session, options.interval)
         self._controls = controls.controls_of(session.env)
+        self._painting: asyncio.Task[None] | None = None
+        self._next_painting = 0.0
         self._loop: asyncio.AbstractEventLoop | None = None
         self._stop = asyncio.Event()
 
@@ -269,11 +274,14 @@ class Console:
                 view = await in_worker(session.begin, kinds)
                 self.tick = view.timestep
                 self.seats.assign(view, kinds)
-                await self._publish(view, kinds, in_worker)
+                await self._show_operators(view, in_worker)
+                self._show_watchers(view, kinds)
                 due = max(due + self.options.interval, self._now())
                 await self._sleep(due)
                 inputs = self.seats.collect(kinds, session.env.spec.action_size)
                 show(await in_worker(session.finish, inputs))
+            if self._painting:
+                await self._painting
         finally:
             worker.shutdown()
 
@@ -306,20 +314,34 @@ class Console:
             if isinstance(client, Client):
                 client.tell({"type": "expired"})
 
-    async def _publish(self, view: View, kinds: Any, in_worker: Callable[..., Any]) -> None:
-        """Leave every page what it is to see of a timestep."""
-        session = self.session
-        watched = any(client.kind == "fleet" for client in self.clients)
-        own = {seat.robot for seat in self.seats.seats if seat.client} - {-1}
-        large, tiles = await in_worker(lambda: pages.draw(session, view, own, tiles=watched))
-        everybody = pages.to_json(pages.fleet(session, view, kinds, tiles)) if watched else ""
-        for client in self.clients:
-            client.heard = 0
-            if client.kind == "fleet" and everybody:
-                client.show(everybody)
+    async def _show_operators(self, view: View, in_worker: Callable[..., Any]) -> None:
+        """Leave everyone in a seat what they are to see of a timestep."""
+        robots = {seat.robot for seat in self.seats.seats if seat.client} - {-1}
+        pictures = await in_worker(pages.portraits, self.session, robots)
         for number, seat in enumerate(self.seats.seats):
             if isinstance(seat.client, Client):
-                seat.client.show(pages.to_json(pages.operator(session, view, number, seat, large)))
+                seat.client.show(pages.to_json(pages.operator(self.session, view, number, seat, pictures)))
+        for client in self.clients:
+            client.heard = 0
+
+    def _show_watchers(self, view: View, kinds: np.ndarray) -> None:
+        """Begin to draw the fleet for those who watch, unless it was begun a moment ago; no timestep waits for it."""
+        if self._painting and self._painting.done():
+            self._painting.result()  # an error, if there was one
+            self._painting = None
+        if self._painting or self._now() < self._next_painting or not any(c.kind == "fleet" for c in self.clients):
+            return
+        self._next_painting = self._now() + BETWEEN_PAINTINGS
+        self._painting = asyncio.create_task(self._paint(view, kinds, self.session.engine.state.env))
+
+    async def _paint(self, view: View, kinds: np.ndarray, env: EnvState) -> None:
+        def draw() -> str:
+            return pages.to_json(pages.fleet(self.session, view, kinds, pages.tiles(self.session, env, view)))
+
+        state = await asyncio.to_thread(draw)
+        for client in self.clients:
+            if client.kind == "fleet":
+                client.show(state)
 
     async def _say_goodbye(self) -> None:
         """Tell every page that it is over, and give them a moment to hear it."""

@@ -11,7 +11,7 @@ from fleetjax.io.operation import Diverged
 from fleetjax.metrics import Metrics, first_divergence
 from fleetjax.priority import get_algorithm
 
-SHOWN = 36  # robots that the fleet's page has pictures of; more if there are more people
+SHOWN = 36  # robots that the fleet's page has pictures of
 
 
 class Session:
@@ -22,6 +22,7 @@ class Session:
 
     Attributes:
         engine: the fleet.
+        num_tiles: robots that the fleet's page has pictures of.
         metrics: Metrics[1] of each timestep so far.
         curves: cumulative successes, violations and idle time, and the return on human effort, after each.
     """
@@ -29,9 +30,8 @@ class Session:
     def __init__(self, run: folder.Run):
         self.run, self.config = run, run.config
         self.env = envs.make(run.config.environment, run.config.backend)
-        number = min(run.config.num_robots, max(SHOWN, run.config.num_humans))
-        self.engine = Engine(run.config, jax.random.key(run.seed), self.env, num_pictures=number)
-        self.num_pictures = number
+        self.num_tiles = min(run.config.num_robots, SHOWN)
+        self.engine = Engine(run.config, jax.random.key(run.seed), self.env, num_pictures=sorted({1, self.num_tiles}))
         self.metrics: list[Metrics] = []
         self._total = dict.fromkeys(Metrics._fields, 0.0)
         self.curves = [self._heights()]

@@ -261,12 +261,11 @@ def _render(arguments: argparse.Namespace) -> None:
         if policy == "robot" and run is None:
             raise ValueError(f"--policy robot needs a run folder, and {arguments.source} is an environment")
         config = run.config if run else make_config(arguments.source, "cur")
-        scene = render.scene_of(config)
         if policy == "expert":
             shown = {"num_robots": arguments.num_shown, "num_humans": arguments.num_shown}
             config = make_config(config.environment, "expert", **shown, backend=config.backend)
         learner = folder.read_policy(run) if run and policy == "robot" else None
-        render.check_gl()
+        render.check(config)
     folder.check_free(arguments.output, overwrite=arguments.overwrite)
     seed = arguments.seed if arguments.seed is not None else run.seed if run else 0
     key = jax.random.key(seed)
@@ -274,8 +273,9 @@ def _render(arguments: argparse.Namespace) -> None:
     config, state = render.start(config, key, learner, skip=arguments.skip)
     film = render.shoot(config.replace(num_steps=arguments.num_steps), key, state, num_shown=arguments.num_shown)
     say("drawing ...")
-    pictures = render.draw(film, scene, width=arguments.width, height=3 * arguments.width // 4, every=arguments.every)
-    rate = 1 / (envs.make(config.environment, config.backend).spec.control_step * arguments.every)
+    env = envs.make(config.environment, config.backend)
+    pictures = render.draw(film, env.scene, width=arguments.width, every=arguments.every)
+    rate = 1 / (env.spec.control_step * arguments.every)
     with _refusing():
         files.write(arguments.output, render.encode(pictures, arguments.output, rate=rate))
     print(arguments.output)

@@ -19,6 +19,7 @@ from fleetjax.config import Config
 from fleetjax.fleet import FleetState, make_fleet
 from fleetjax.learning.imitation import LearnerState
 from fleetjax.run import evaluate, prepare, run
+from fleetjax.types import EnvState
 
 FORMATS = (".gif", ".mp4")
 CAMERA = "track"  # that every model has
@@ -33,14 +34,12 @@ class Film(NamedTuple):
     """What there is to see, in numpy arrays.
 
     Attributes:
-        pose: f32[T, K, nq] positions of the joints.
-        mocap: f32[T, K, nmocap, 7] positions and orientations of what is only shown.
+        seen: arrays [T, K, ...]: positions of the joints, and of what is only shown; or a picture from above.
         violating: bool[T, K].
         teleoperated: bool[T, K].
     """
 
-    pose: np.ndarray
-    mocap: np.ndarray
+    seen: tuple[np.ndarray, ...]
     violating: np.ndarray
     teleoperated: np.ndarray
 
@@ -57,16 +56,17 @@ def check_format(path: Path) -> None:
         raise ValueError(f'{path} needs imageio with ffmpeg: pip install "fleetjax[video]", or choose a .gif')
 
 
-def scene_of(config: Config) -> envs.Scene:
-    """Return how the environment is drawn.
+def check(config: Config) -> None:
+    """Check that there is something to draw, and with what.
 
     Raises:
-        ValueError: if it has nothing to draw.
+        ValueError: if the environment has nothing to draw, or an OpenGL library is needed and there is none.
     """
-    scene = envs.make(config.environment, config.backend).scene
-    if scene is None:
-        raise ValueError(f"environment = {config.environment!r} has no bodies to draw; choose one with physics")
-    return scene
+    env = envs.make(config.environment, config.backend)
+    if env.scene is None and env.picture is None:
+        raise ValueError(f"environment = {config.environment!r} has nothing to draw; choose another")
+    if env.scene:
+        check_gl()
 
 
 def start(config: Config, key: jax.Array, learner: LearnerState | None, *, skip: int) -> tuple[Config, FleetState]:
@@ -87,7 +87,9 @@ def start(config: Config, key: jax.Array, learner: LearnerState | None, *, skip:
 
 def shoot(config: Config, key: jax.Array, state: FleetState, *, num_shown: int) -> Film:
     """Run `config.num_steps` timesteps from `state`, as `fleetjax.run` does, and keep what the first robots look like."""
-    env, scene = envs.make(config.environment, config.backend), scene_of(config)
+    env = envs.make(config.environment, config.backend)
+    draw = env.picture
+    look: Callable[[EnvState], Any] = env.scene.pose if env.scene else lambda state: (draw(state),) if draw else ()
     fleet = make_fleet(config, env)
     _, key_steps = jax.random.split(key)
 
@@ -95,24 +97,47 @@ def shoot(config: Config, key: jax.Array, state: FleetState, *, num_shown: int) 
         after, _metrics = fleet.step(state, jax.random.fold_in(key_steps, state.timestep))
         helped = helper_of(after.humans, config.num_robots) >= 0
         seen = jax.tree.map(lambda x: x[:num_shown], (state.env, helped & ~after.resetting))
-        return after, (*jax.vmap(scene.pose)(seen[0]), seen[0].violation, seen[1])
+        return after, Film(jax.vmap(look)(seen[0]), seen[0].violation, seen[1])
 
     film = jax.jit(lambda state: jax.lax.scan(timestep, state, length=config.num_steps)[1])
-    return Film(*jax.device_get(film(state)))
+    return jax.device_get(film(state))
 
 
-def draw(film: Film, scene: envs.Scene, *, width: int, height: int, every: int) -> Iterator[np.ndarray]:
-    """Yield a picture u8[H, W, 3] of every `every`-th timestep: a grid of tiles of `width` x `height` pixels.
+def draw(film: Film, scene: envs.Scene | None, *, width: int, every: int) -> Iterator[np.ndarray]:
+    """Yield a picture u8[H, W, 3] of every `every`-th timestep: a grid of tiles `width` pixels wide.
+
+    Args:
+        film: what there is to see.
+        scene: how bodies are drawn; None if the film holds pictures.
+        width: of a tile.
+        every: timesteps from one picture to the next.
 
     Raises:
         ValueError: if no OpenGL library is found.
     """
-    columns = int(np.ceil(np.sqrt(film.pose.shape[1])))
-    with _painter(scene.model, width, height) as paint:
-        for t in range(0, len(film.pose), every):
-            tiles = [paint(*robot) for robot in zip(*(x[t] for x in film), strict=True)]
+    length, number = film.violating.shape
+    columns = int(np.ceil(np.sqrt(number)))
+    with _painter(scene.model, width, 3 * width // 4) if scene else contextlib.nullcontext(_frame(width)) as paint:
+        for t in range(0, length, every):
+            tiles = [paint(*robot) for robot in zip(*(x[t] for x in (*film.seen, *film[1:])), strict=True)]
             tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % columns)
             yield np.vstack([np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)])
+
+
+def _frame(width: int) -> Callable[..., np.ndarray]:
+    """Return a function from a picture from above and the robot's two marks to a tile, framed in the colour of its mark."""
+    from PIL import Image
+
+    def paint(picture: np.ndarray, violating: bool, teleoperated: bool) -> np.ndarray:
+        tile = np.array(Image.fromarray(picture).resize((width, width)))
+        if violating or teleoperated:
+            edge = max(1, width // 40)
+            inner = tile[edge:-edge, edge:-edge].copy()
+            tile[:] = np.round(255 * np.array(VIOLATING if violating else TELEOPERATED)).astype(np.uint8)
+            tile[edge:-edge, edge:-edge] = inner
+        return tile
+
+    return paint
 
 
 @contextlib.contextmanager

@@ -25,7 +25,7 @@ def oracle(params, x):
     image, others = np.asarray(x[:288], np.float64).reshape(SHAPE), np.asarray(x[288:], np.float64)
     layers = params["params"]
     first = layers["layers_0"]
-    features = np.empty((2, 3, 32))
+    features = np.empty((2, 3, 16))
     for i in range(2):
         for j in range(3):
             patch = image[4 * i : 4 * i + 4, 4 * j : 4 * j + 4].ravel()

@@ -71,7 +71,7 @@ _ENVS: dict[str, _Entry] = {
             "augmented_copies": 10,
             "critic_capacity": 4000,
             "num_critic_transitions": 2000,
-            "critic_pretraining_steps": 1000,
+            "critic_pretraining_steps": 500,
         },
     ),
     "navigation": _Entry(

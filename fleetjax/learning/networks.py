@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from fleetjax.envs import EnvSpec
 
-STAGES = ((4, 32), (1, 32))  # of the convolutions: side of a patch in pixels, which is also the stride, and channels
+STAGES = ((4, 24), (1, 16))  # of the convolutions: side of a patch in pixels, which is also the stride, and channels
 MID_GREY, SPREAD = 127.5, 64.0  # how networks see pixel values, whatever the data
 
 

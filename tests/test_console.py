@@ -6,6 +6,7 @@ import json
 import logging
 import os
 import signal
+import socket
 import threading
 
 import jax
@@ -333,6 +334,18 @@ def test_addresses_beyond_this_machine_need_a_token():
     for token in ("", "short", "with space in it", "a" * 129, "semi;colon;token"):
         with pytest.raises(ValueError, match="8 to 128"):
             guard.check_address("127.0.0.1", token)
+
+
+def test_beyond_this_machine_addresses_and_its_own_name_are_let_in_and_other_names_are_not():
+    async def app(scope, receive, send):
+        raise AssertionError("not called")
+
+    open_guard = guard.Guard(app, "0.0.0.0", "long-enough")
+    for name in ("192.168.0.4:8765", "[fe80::1]:8765", "localhost", socket.gethostname()):
+        assert open_guard._is_here([name]), name
+    for names in (["evil.example"], ["192.168.0.4.evil.example:8765"], [], ["localhost", "localhost"], [""], ["[", "x"]):
+        assert not open_guard._is_here(names), names
+    assert not guard.Guard(app, "127.0.0.1", None)._is_here(["192.168.0.4:8765"])
 
 
 # The command line

@@ -253,6 +253,21 @@ def test_a_lost_connection_frees_the_seat_and_gives_nothing_more(session):
     assert rows["robot"][-1, 0] == -1
 
 
+def test_what_was_not_used_when_a_connection_is_lost_is_forgotten(session):
+    with serving(session, interval=3.0, wait=1) as served:
+        with served.page() as page:
+            claim(page)
+            act(page, hear(page, "state"))
+            act(page, {})
+            hear(page, "refused")  # so the first was taken
+            assert served.console.seats.seats[0].action is not None
+        while served.console.clients:
+            pass
+        assert served.console.seats.seats[0].key
+        served.console.options = served.console.options._replace(interval=0.02)
+    assert not records(session)["given"].any()
+
+
 def test_a_crashed_robot_of_a_lost_person_waits(session):
     place(session, *[placed([-0.8, 0.0], [-0.5, 0.0], violation=True)] * 4)
     with serving(session, timeout=2.0) as served:

@@ -13,6 +13,7 @@ let facts = { actions: [], hold: true, verb: "move", interval: 0.1, resetTime: 1
 let state = { mode: "free", robot: -1 };
 const held = new Map(); // what is held, by what holds it: a key or a button
 const buttons = new Map();
+let noted; // the timer that takes a note away
 
 const send = connect("/ws/operator", {
   open: () => claim(),
@@ -30,8 +31,8 @@ const send = connect("/ws/operator", {
   },
   ping: () => send({ type: "seen" }),
   state: update,
-  refused: (message) => write(byId("note"), message.reason),
-  error: (message) => write(byId("note"), message.reason),
+  refused: (message) => note(message.reason),
+  error: (message) => note(message.reason),
   over: () => {
     idle();
     say("The session is over. Thank you!");
@@ -89,6 +90,15 @@ function say(text) {
   write(byId("turn"), text);
 }
 
+
+
+/** Show a short note for a moment. */
+function note(text) {
+  write(byId("note"), text);
+  clearTimeout(noted);
+  noted = setTimeout(() => write(byId("note"), ""), 3000);
+}
+
 function idle() {
   letGo();
   show({ mode: "free", robot: -1 });
@@ -120,7 +130,6 @@ function show(message) {
   write(byId("why"), message.why ?? "-");
   write(byId("bound"), boundText(message));
   write(byId("tick"), message.tick === undefined ? "-" : `${message.tick} of ${message.steps}`);
-  if (message.mode === "free") write(byId("note"), "");
   showSignals(message.signals ?? []);
 }
 

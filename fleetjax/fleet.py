@@ -120,6 +120,7 @@ def make_fleet(config: Config, env: Env) -> Fleet:
     supervisor = supervisors.make(config.supervisor or env.spec.supervisor, env)
     learner = imitation.make_learner(config, env.spec)
     critics = {kind: critic.make_critic(kind, config, env.spec, learner) for kind in algorithm.critics}
+    learn = _make_learning(config, learner, critics)
     num_robots = config.num_robots
     robots = jnp.arange(num_robots)
 
@@ -191,6 +192,23 @@ def make_fleet(config: Config, env: Env) -> Fleet:
         state = FleetState(state.timestep + 1, after, humans, plan.resetting, policy, human_data, critic_states, state.priority)
         return state, metrics, stepped
 
+    def logged_step(state: FleetState, key: jax.Array) -> tuple[FleetState, tuple[Metrics, Interventions]]:
+        key_plan, key_human, key_advance = jax.random.split(key, 3)
+        state, plan_ = plan(state, key_plan)
+        human_action = jax.vmap(supervisor.act)(state.env, jax.random.split(key_human, num_robots))
+        after, metrics, stepped = act(state, plan_, human_action, plan_.teleoperated, key_advance)
+        return after, (metrics, _watch(state.env, plan_, human_action, stepped))
+
+    def step(state: FleetState, key: jax.Array) -> tuple[FleetState, Metrics]:
+        after, (metrics, _) = logged_step(state, key)
+        return after, metrics
+
+    return Fleet(plan, advance, step, logged_step)
+
+
+def _make_learning(config: Config, learner: imitation.Learner, critics: dict[str, critic.Critic]) -> Callable[..., Any]:
+    """Return `(LearnerState, HumanData, critics' states, key) -> (LearnerState, critics' states, loss f32[])`."""
+
     def learn(policy, human_data, critic_states, key):
         """Take the timestep's gradient steps, policy first."""
 
@@ -205,18 +223,7 @@ def make_fleet(config: Config, env: Env) -> Fleet:
         (policy, critic_states), losses = jax.lax.scan(gradient_step, (policy, critic_states), keys)
         return policy, critic_states, jnp.sum(losses) / max(config.gradient_steps, 1)
 
-    def logged_step(state: FleetState, key: jax.Array) -> tuple[FleetState, tuple[Metrics, Interventions]]:
-        key_plan, key_human, key_advance = jax.random.split(key, 3)
-        state, plan_ = plan(state, key_plan)
-        human_action = jax.vmap(supervisor.act)(state.env, jax.random.split(key_human, num_robots))
-        after, metrics, stepped = act(state, plan_, human_action, plan_.teleoperated, key_advance)
-        return after, (metrics, _watch(state.env, plan_, human_action, stepped))
-
-    def step(state: FleetState, key: jax.Array) -> tuple[FleetState, Metrics]:
-        after, (metrics, _) = logged_step(state, key)
-        return after, metrics
-
-    return Fleet(plan, advance, step, logged_step)
+    return learn
 
 
 def _watch(before: EnvState, plan: Plan, human_action: jax.Array, stepped: EnvState) -> Interventions:

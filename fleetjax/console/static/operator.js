@@ -146,17 +146,20 @@ function showSignals(signals) {
   while (box.children.length > signals.length) box.lastChild.remove();
   while (box.children.length < signals.length) {
     const row = make("div", "", { class: "signal" });
-    row.append(make("span"), make("div", "", { class: "scale" }), make("output"));
-    row.children[1].append(make("meter", "", { min: 0, max: 1 }));
+    row.append(make("span"), make("div", "", { class: "scale", role: "meter" }), make("output"));
+    row.children[1].append(make("span", ""));
     box.append(row);
   }
   signals.forEach((signal, i) => {
     const row = box.children[i];
     const limit = signal.threshold;
-    const meter = row.querySelector("meter");
+    const meter = row.children[1];
+    const top = limit === null ? 1 : 2 * limit;
     write(row.firstChild, signal.name);
     meter.setAttribute("aria-label", signal.name);
-    meter.value = limit === null ? signal.value : Math.min(1, signal.value / (2 * limit || 1e-9));
+    meter.setAttribute("aria-valuemax", Math.max(top, signal.value));
+    meter.setAttribute("aria-valuenow", signal.value);
+    meter.firstChild.style.width = `${100 * Math.min(1, signal.value / (top || 1e-9))}%`;
     const text = signal.value.toPrecision(2);
     write(row.lastChild, limit === null ? text : `${text}, threshold ${Number(limit.toPrecision(3))}`);
     row.classList.toggle("limited", limit !== null);

@@ -166,8 +166,8 @@ def test_help_tells_every_parameter_with_meaning_unit_and_default(capsys):
         if name != "environment":
             assert f"--{name.replace('_', '-')}" in shown
             assert f"{field.help}{f' ({field.unit})' if field.unit else ''} [default: " in shown
-    assert "operation time T (timesteps) [default: 10000; navigation 2000]" in shown
-    assert "units of the hidden layers of policy and critics [default: 256 256; navigation 64 64]" in shown
+    assert "operation time T (timesteps) [default: 10000; block_push 250; navigation 2000]" in shown
+    assert "units of the hidden layers of policy and critics [default: 256 256; block_push 128; navigation 64 64]" in shown
     assert "--no-normalize-observations" in shown
 
 

@@ -23,6 +23,7 @@ def make_config(name: str, algorithm: str, **changed) -> fleetjax.Config:
         "ensemble_size": 2,
         "batch_size": 4,
         "num_demonstrations": 4,
+        "augmented_copies": 1,
     }
     short = {"num_steps": 40, "hard_reset_time": 3, "human_capacity": 400, "critic_capacity": 300, "uncertainty_threshold": 0.0}
     return fleetjax.make_config(name, algorithm, **small | short | {"initial_period": 0, "gradient_steps": 0} | changed)

@@ -46,23 +46,6 @@ class LearnerState(NamedTuple):
     normalizer: Normalizer
 
 
-class Learner(NamedTuple):
-    """Pure functions of the ensemble.
-
-    Attributes:
-        init: `(key, Normalizer) -> LearnerState`.
-        predict: `(LearnerState, obs f32[..., O]) -> (action f32[..., A], uncertainty f32[...])`; the uncertainty lies in
-            [0, 1] (discrete: entropy in nats).
-        update: `(LearnerState, HumanData, key) -> (LearnerState, loss f32[])`, one gradient step.
-        append: `(HumanData, Pair[K], mask bool[K], key) -> HumanData` adds pairs, in `augmented_copies` if so configured.
-    """
-
-    init: Any
-    predict: Any
-    update: Any
-    append: Any
-
-
 def create_data(spec: EnvSpec, *, ensemble_size: int, capacity: int) -> HumanData:
     """Return an empty data set."""
     example = Pair(stored_obs(spec), jnp.zeros(spec.action_size))
@@ -106,6 +89,23 @@ def append_augmented(
         return append(data, same, jnp.broadcast_to(wanted, copies), key_data), None
 
     return jax.lax.scan(add, data, (pairs, mask, jax.random.split(key, mask.shape[0])))[0]
+
+
+class Learner(NamedTuple):
+    """Pure functions of the ensemble.
+
+    Attributes:
+        init: `(key, Normalizer) -> LearnerState`.
+        predict: `(LearnerState, obs f32[..., O]) -> (action f32[..., A], uncertainty f32[...])`; the uncertainty lies in
+            [0, 1] (discrete: entropy in nats).
+        update: `(LearnerState, HumanData, key) -> (LearnerState, loss f32[])`, one gradient step.
+        append: `(HumanData, Pair[K], mask bool[K], key) -> HumanData` adds pairs, in `augmented_copies` if so configured.
+    """
+
+    init: Any
+    predict: Any
+    update: Any
+    append: Any = append
 
 
 def make_learner(config: Config, spec: EnvSpec) -> Learner:

@@ -13,6 +13,7 @@ from fleetjax.config import Config
 from fleetjax.io import figure, files, folder, text
 from fleetjax.metrics import Metrics
 
+ALGORITHMS = ("constraint", "random", "ensemble_dagger", "thrifty_dagger", "cur", "expert")
 COLUMNS = {"successes": "successes", "violations": "violations", "idle": "idle", "human_steps": "human time"}
 Case = tuple[str, str, int]  # environment, algorithm, seed
 
@@ -29,8 +30,7 @@ def fits(environment: str, algorithm: str) -> bool:
 def finished(path: Path) -> bool:
     """Return whether a run folder holds a run of full length."""
     try:
-        run = folder.read_run(path)
-        return len(folder.read_metrics(run).successes) == run.config.num_steps
+        return folder.read_finished(folder.read_run(path)) is not None
     except (OSError, ValueError):
         return False
 
@@ -75,10 +75,10 @@ def show(data: list[tuple[Config, int, Metrics]], picture: Path) -> None:
     print(f"\n{picture}")
 
 
-def make_parser(about: str | None, *, output: Path, seeds: list[int], algorithms: Iterable[str]) -> argparse.ArgumentParser:
+def make_parser(about: str | None, *, output: Path, seeds: list[int]) -> argparse.ArgumentParser:
     """Return a parser of what such scripts can be told, with these defaults."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--algorithms", nargs="+", choices=fleetjax.list_algorithms(), default=list(algorithms))
+    parser.add_argument("--algorithms", nargs="+", choices=fleetjax.list_algorithms(), default=list(ALGORITHMS))
     parser.add_argument("--seeds", type=int, nargs="+", default=seeds)
     parser.add_argument("--output", type=Path, default=output)
     return parser

@@ -11,12 +11,10 @@ from comparison import fits, make_parser, run_missing, show
 
 import fleetjax
 
-ALGORITHMS = ("constraint", "random", "ensemble_dagger", "thrifty_dagger", "cur", "expert")
-
 
 def main() -> None:
     """Run what is missing, then show all."""
-    parser = make_parser(__doc__, output=Path("runs/first_look"), seeds=[0], algorithms=ALGORITHMS)
+    parser = make_parser(__doc__, output=Path("runs/first_look"), seeds=[0])
     parser.add_argument("--environments", nargs="+", choices=fleetjax.list_envs(), default=fleetjax.list_envs())
     args = parser.parse_args()
     cases = [(e, a, s) for e in args.environments for a in args.algorithms if fits(e, a) for s in args.seeds]

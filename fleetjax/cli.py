@@ -134,8 +134,12 @@ def _run_in(run: folder.Run, *, resume: bool, checkpoint_every: int) -> None:
     else:
         folder.write_config(run, sealed=False) if resume else folder.create(run)
         metrics = _operate(run, resume=resume, checkpoint_every=checkpoint_every)
+    _report(run, metrics, f"{text.duration(time.monotonic() - begun)} in all")
+
+
+def _report(run: folder.Run, metrics: Metrics, last: str) -> None:
     print(f"\n{text.headline(run.config, run.seed)}\n\n{text.run_table(metrics, run.config)}\n")
-    print(f"{text.duration(time.monotonic() - begun)} in all. Run folder: {run.folder}")
+    print(f"{last}. Run folder: {run.folder}")
 
 
 def _operate(run: folder.Run, *, resume: bool, checkpoint_every: int) -> Metrics:
@@ -301,8 +305,7 @@ def _console(arguments: argparse.Namespace) -> None:
         run.folder.mkdir(parents=True, exist_ok=True)
         with files.lock(run.folder):
             metrics = command.supervise(run, options, listener, lambda metrics: _save(run, metrics))
-    print(f"\n{text.headline(run.config, run.seed)}\n\n{text.run_table(metrics, run.config)}\n")
-    print(f"{text.plural(len(metrics.successes), 'timestep')} recorded. Run folder: {run.folder}")
+    _report(run, metrics, f"{text.plural(len(metrics.successes), 'timestep')} recorded")
 
 
 def _replay(arguments: argparse.Namespace) -> None:

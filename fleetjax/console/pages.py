@@ -82,6 +82,7 @@ def operator(session: Session, view: View, number: int, seat: Seat, pictures: Ma
     if robot < 0:
         return content | {"mode": "free"}
     config, done = session.config, int(view.duration[number])
+    signals = _signals(session, view, robot)
     needed = int(config.hard_reset_time if seat.resetting else config.min_teleop_time)
     return content | {
         "since": seat.since,
@@ -89,8 +90,8 @@ def operator(session: Session, view: View, number: int, seat: Seat, pictures: Ma
         "confirmed": seat.confirmed,
         "bound": max(0, needed - done),
         "needed": needed,
-        "why": _why(session, view, robot, bound=done < needed),
-        "signals": _signals(session, view, robot),
+        "why": _why(signals, violation=bool(view.violation[robot]), bound=done < needed),
+        "signals": signals,
         "picture": pictures.get(robot),
     }
 
@@ -109,11 +110,11 @@ def _signals(session: Session, view: View, robot: int) -> list[dict[str, Any]]:
     return [{"name": name, "value": value, "threshold": threshold} for name, value, threshold in rows]
 
 
-def _why(session: Session, view: View, robot: int, *, bound: bool) -> str:
+def _why(signals: list[dict[str, Any]], *, violation: bool, bound: bool) -> str:
     """Return why a robot has help, in a few words."""
-    if view.violation[robot]:
+    if violation:
         return "in violation: it stands still until a hard reset"
-    above = [s["name"] for s in _signals(session, view, robot) if s["threshold"] is not None and s["value"] >= s["threshold"]]
+    above = [s["name"] for s in signals if s["threshold"] is not None and s["value"] >= s["threshold"]]
     if above:
         return " and ".join(above) + " above the threshold"
     return "no signal is above its threshold now; the help still has its shortest time to go" if bound else "its priority"

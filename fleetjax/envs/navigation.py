@@ -25,13 +25,8 @@ DOOR_WIDTH = 0.36  # m
 WALL_THICKNESS = 0.06  # m
 MARGIN = 0.12  # m, between a start or a goal and the nearest wall
 ROBOT_RADIUS, PICTURE_SIZE = 0.05, 192  # m and pixels, in pictures only: the robot is a point
-FLOOR, WALL, GOAL, ROBOT, STUCK = (
-    (238, 236, 230),
-    (70, 74, 84),
-    (96, 180, 110),
-    (40, 90, 200),
-    (210, 50, 40),
-)  # red, green, blue
+# Their colours: red, green, blue.
+FLOOR, WALL, GOAL, ROBOT, STUCK = (238, 236, 230), (70, 74, 84), (96, 180, 110), (40, 90, 200), (210, 50, 40)
 
 
 def make_env() -> base.Env:

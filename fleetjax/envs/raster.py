@@ -26,7 +26,7 @@ def box(points: jax.Array, centre: jax.Array, half: jax.Array, angle: jax.Array 
 
 
 def paint(
-    picture: jax.Array, distance: jax.Array, colour: "tuple[float, float, float] | jax.Array", opacity: float = 1.0
+    picture: jax.Array, distance: jax.Array, colour: tuple[float, float, float] | jax.Array, opacity: float = 1.0
 ) -> jax.Array:
     """Return the picture f32[H, W, 3], of 0 to 255, with a shape painted over it; its edge is one pixel wide.
 

@@ -90,8 +90,6 @@ function say(text) {
   write(byId("turn"), text);
 }
 
-
-
 /** Show a short note for a moment. */
 function note(text) {
   write(byId("note"), text);

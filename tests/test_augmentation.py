@@ -30,7 +30,7 @@ def oracle(image, key):
     return np.clip(image, 0, 255)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", [0, 1, 2, 3, 4, 21])  # 21 draws almost the widest blur
 def test_an_augmented_image_is_that_of_the_definition(seed):
     image = np.random.default_rng(seed).integers(0, 256, IMAGE_SHAPE).astype(np.float32)
     found = np.asarray(jax.jit(augmentation.augment)(image, jax.random.key(seed)))

@@ -81,6 +81,13 @@ def test_a_push_over_the_border_is_a_violation_and_no_success(env):
     assert not after.success.any()
 
 
+def test_a_goal_is_reached_within_its_radius(env):
+    after = pushes(env, begun(goal=(0.22, 0.0)), RIGHT)
+    distance = np.linalg.norm(np.asarray(after.physics.position) - [0.22, 0.0], axis=1)
+    assert 0.3 < np.mean(distance < 0.1) < 0.9
+    np.testing.assert_array_equal(after.success, distance < 0.1)
+
+
 def test_a_goal_that_is_reached_is_a_success_and_gives_way_to_a_new_one(env):
     state = begun((0.4, 0.4), goal=(0.53, 0.4))
     after = pushes(env, state, RIGHT)
@@ -140,7 +147,7 @@ def test_people_see_the_same_in_more_pixels(env):
         ((0, 0), 0.0, (-0.5, 0.4), {LEFT, UP}),
         ((0, 0), 0.0, (0.6, 0.0), {RIGHT}),
         ((0, 0), 0.7, (0.0, 0.6), {UP, RIGHT}),  # the cube is turned: its right face pushes up as well
-        ((0.62, -0.4), 0.0, (0.7, 0.2), {UP}),  # to the right would be quicker, if it were safe
+        ((0.62, -0.4), 0.0, (0.9, -0.2), {UP}),  # to the right would be quicker, if it were safe
     ],
 )
 def test_the_teacher_knows_all_good_pushes(position, angle, goal, good):

@@ -11,7 +11,7 @@ highest returns on many fresh episodes and writes the best one to `fleetjax/supe
 
 import argparse
 import csv
-import functools
+import dataclasses
 import json
 import time
 from collections.abc import Callable
@@ -26,7 +26,7 @@ from brax.envs.base import State
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks, train
 from flax import linen, serialization
-from trainings import SHARED, TRAININGS, Stage, Training
+from trainings import SHARED, TRAININGS, Mirror, Stage, Training
 
 from fleetjax import tree
 from fleetjax.supervisors import expert
@@ -34,14 +34,39 @@ from fleetjax.supervisors import expert
 PACKAGE_WEIGHTS = Path(expert.__file__).parent / "weights"
 
 
-def network_factory(training: Training) -> Callable[..., networks.PPONetworks]:
+def network_factory(training: Training, mirror: Mirror | None = None) -> Callable[..., networks.PPONetworks]:
     """Return what builds the policy and value network."""
-    return functools.partial(
-        networks.make_ppo_networks,
-        policy_hidden_layer_sizes=training.hidden_sizes,
-        value_hidden_layer_sizes=training.hidden_sizes,
-        activation=linen.elu,
-        **training.network,
+
+    def make_networks(*args, **kwargs) -> networks.PPONetworks:
+        nets = networks.make_ppo_networks(
+            *args,
+            **kwargs,
+            policy_hidden_layer_sizes=training.hidden_sizes,
+            value_hidden_layer_sizes=training.hidden_sizes,
+            activation=linen.elu,
+            **training.network,
+        )
+        return nets if mirror is None else symmetric(nets, mirror)
+
+    return make_networks
+
+
+def symmetric(nets: networks.PPONetworks, mirror: Mirror) -> networks.PPONetworks:
+    """Return networks that average over a robot and its mirror image; actions come from a `CLIPPED_NORMAL` policy."""
+    policy_of, value_of = nets.policy_network.apply, nets.value_network.apply
+
+    def policy(processor, params, obs):
+        mean, std = policy_of(processor, params, obs)
+        mean_mirrored, std_mirrored = policy_of(processor, params, mirror.obs(obs))
+        return (mean + mirror.action(mean_mirrored)) / 2, (std + jnp.abs(mirror.action(std_mirrored))) / 2
+
+    def value(processor, params, obs):
+        return (value_of(processor, params, obs) + value_of(processor, params, mirror.obs(obs))) / 2
+
+    return dataclasses.replace(
+        nets,
+        policy_network=dataclasses.replace(nets.policy_network, apply=policy),
+        value_network=dataclasses.replace(nets.value_network, apply=value),
     )
 
 
@@ -192,7 +217,7 @@ def train_stage(task: Task, folder: Path, *, num_timesteps: int, evaluate_every:
         num_timesteps=remaining,
         episode_length=task.training.episode_length,
         normalize_observations=True,
-        network_factory=network_factory(task.training),
+        network_factory=network_factory(task.training, task.stage.mirror),
         num_evals=max(2, 1 + remaining // evaluate_every),
         deterministic_eval=True,
         num_eval_envs=128,
@@ -204,6 +229,20 @@ def train_stage(task: Task, folder: Path, *, num_timesteps: int, evaluate_every:
     )
 
 
+def with_mirror_image(layers: list[Any], statistics: Any, mirror: Mirror) -> list[dict[str, np.ndarray]]:
+    """Return layers, twice as wide, that do what `symmetric` makes of a policy's layers."""
+    first, *inner, last = [{name: np.asarray(value) for name, value in layer.items()} for layer in layers]
+    mean, std = np.asarray(statistics.mean), np.asarray(statistics.std)
+    seen, done = np.asarray(mirror.obs(jnp.eye(mean.size))), np.asarray(mirror.action(jnp.eye(last["bias"].size)))
+    turned, shift = std[:, None] * seen / std, (mean @ seen - mean) / std  # of normalised observations
+    kernel, bias = first["kernel"], first["bias"]
+    return [
+        {"kernel": np.hstack([kernel, turned @ kernel]), "bias": np.hstack([bias, bias + shift @ kernel])},
+        *({"kernel": np.kron(np.eye(2), layer["kernel"]), "bias": np.tile(layer["bias"], 2)} for layer in inner),
+        {"kernel": np.vstack([last["kernel"], last["kernel"] @ done]) / 2, "bias": (last["bias"] + last["bias"] @ done) / 2},
+    ]
+
+
 def as_weights(params, training: Training) -> dict[str, np.ndarray]:
     """Turn brax parameters into the arrays that the package ships (see `fleetjax.supervisors.expert`)."""
     statistics, policy, _ = params
@@ -211,6 +250,8 @@ def as_weights(params, training: Training) -> dict[str, np.ndarray]:
     clipped = "MLP_0" in modules
     layers = [layer for _, layer in sorted((modules["MLP_0"] if clipped else modules).items())]
     layers = [*layers, modules["Dense_0"]] if clipped else layers
+    mirror = training.stages[-1].mirror
+    layers = layers if mirror is None else with_mirror_image(layers, statistics, mirror)
     gains = np.ones(statistics.mean.shape, np.float32)
     gains[list(training.gains)] = list(training.gains.values())
     weights: dict[str, Any] = {"obs_mean": statistics.mean / gains, "obs_std": statistics.std / gains}
@@ -219,7 +260,7 @@ def as_weights(params, training: Training) -> dict[str, np.ndarray]:
         weights[f"kernel_{i}"], weights[f"bias_{i}"] = layer["kernel"][:, :actions], layer["bias"][:actions]
     weights |= {"bound": np.float32(1.0)} if clipped else {}
     weights |= {"step_size": np.float32(training.step_size)} if training.step_size else {}
-    return {name: np.asarray(value) for name, value in weights.items()}
+    return {name: np.asarray(value, np.float32) for name, value in weights.items()}
 
 
 def ship(name: str, folder: Path, *, candidates: int, num_episodes: int) -> None:

@@ -12,44 +12,69 @@ from brax.training.agents.ppo import networks
 from trainings import TRAININGS
 
 from fleetjax import envs, supervisors
-from fleetjax.envs import allegro_hand
+from fleetjax.envs import allegro_hand, anymal
 from fleetjax.supervisors import expert
 
 
 def trained(name):
     """Return a training, brax's networks, and parameters in which every number matters."""
     training = TRAININGS[name]
-    nets = train_expert.network_factory(training)(11, 3, preprocess_observations_fn=running_statistics.normalize)
+    factory = train_expert.network_factory(training, training.stages[-1].mirror)
+    nets = factory(48, 12, preprocess_observations_fn=running_statistics.normalize)
     policy = nets.policy_network.init(jax.random.key(0))
     policy = jax.tree.map(lambda x: x + 0.1 * jax.random.normal(jax.random.key(1), x.shape), policy)
-    statistics = running_statistics.init_state(specs.Array((11,), jnp.dtype("float32")))
-    draws = 2.0 + 3.0 * jax.random.normal(jax.random.key(2), (50, 11))
+    statistics = running_statistics.init_state(specs.Array((48,), jnp.dtype("float32")))
+    draws = 2.0 + 3.0 * jax.random.normal(jax.random.key(2), (50, 48))
     return training, nets, (running_statistics.update(statistics, draws), policy, None)
 
 
 @pytest.mark.parametrize("name", ["humanoid", "anymal", "allegro_hand"])
 def test_weights_act_as_brax_does(name):
-    """tanh of the mean, the clipped mean, or the last action and a part of the clipped mean."""
+    """tanh of the mean, the clipped mean of robot and mirror image, or the last action and a part of the clipped mean."""
     training, nets, params = trained(name)
-    obs = 5.0 * jax.random.normal(jax.random.key(3), (40, 11))
+    obs = 5.0 * jax.random.normal(jax.random.key(3), (40, 48))
     policy = networks.make_inference_fn(nets)(params[:2], deterministic=True)
     action = np.clip(policy(obs, jax.random.key(0))[0], -1, 1)
     if training.step_size:
-        action = np.clip(np.asarray(obs)[:, -3:] + training.step_size * action, -1, 1)
+        action = np.clip(np.asarray(obs)[:, -12:] + training.step_size * action, -1, 1)
     weights = train_expert.as_weights(params, training._replace(gains={}))
     np.testing.assert_allclose(expert.policy(weights, obs), action, atol=2e-5)
     np.testing.assert_allclose(expert.policy(weights, obs[7]), action[7], atol=2e-5)
     assert np.std(action) > 0.1
-    seen = obs * np.array([1, 1, 0.5, 1, 1, 1, 1, 2, 1, 1, 1])
+    seen = obs.at[:, 2].multiply(0.5).at[:, 7].multiply(2.0)
     gained = train_expert.as_weights(params, training._replace(gains={7: 2.0, 2: 0.5}, step_size=None))
     plain = train_expert.as_weights(params, training._replace(gains={}, step_size=None))
     np.testing.assert_allclose(expert.policy(gained, obs), expert.policy(plain, seen), atol=2e-5)
 
 
+def test_a_mirror_image_does_the_mirrored_thing_in_the_task_as_well():
+    mirror, task = TRAININGS["anymal"].stages[-1].mirror, envs.make("anymal", "native")
+    assert mirror is not None
+    state = task.reset(jax.random.key(0), jnp.int32(0))
+    image = _mirror_image(state, mirror)
+    step = jax.jit(task.step)
+    for key in jax.random.split(jax.random.key(1), 8):
+        action = 0.3 * jax.random.normal(key, (12,))
+        state = step(state, action, jnp.bool_(True), key)
+        image = step(image, mirror.action(action), jnp.bool_(True), key)
+        np.testing.assert_allclose(image.obs, mirror.obs(state.obs), atol=0.02)
+        assert np.abs(image.obs - state.obs).max() > 0.3
+    np.testing.assert_array_equal(mirror.obs(mirror.obs(state.obs)), state.obs)
+
+
+def _mirror_image(state, mirror):
+    """Return the beginning of an episode with left and right changed over: the robot stands straight, and does not move."""
+    walker = state.physics
+    joints = [mirror.action(x) for x in (walker.body.qpos[7:], walker.body.qvel[6:])]
+    body = walker.body._replace(qpos=walker.body.qpos.at[7:].set(joints[0]), qvel=walker.body.qvel.at[6:].set(joints[1]))
+    walker = walker._replace(body=body, command=walker.command * jnp.array([1, -1, -1]))
+    return state._replace(physics=walker, obs=anymal.observe(walker, jnp.zeros(12)))
+
+
 def test_a_stage_sets_the_noise_and_nothing_else():
     _, _, (_, policy, _) = trained("anymal")
     changed = train_expert.set_noise(policy, 0.25)["params"]
-    np.testing.assert_allclose(np.exp(changed["std_logparam"]["log_value"]), np.full(3, 0.25), rtol=1e-6)
+    np.testing.assert_allclose(np.exp(changed["std_logparam"]["log_value"]), np.full(12, 0.25), rtol=1e-6)
     for module in ("MLP_0", "Dense_0"):
         jax.tree.map(np.testing.assert_array_equal, changed[module], policy["params"][module])
 

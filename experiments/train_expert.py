@@ -63,8 +63,7 @@ def symmetric(nets: networks.PPONetworks, mirror: Mirror) -> networks.PPONetwork
     def value(processor, params, obs):
         return (value_of(processor, params, obs) + value_of(processor, params, mirror.obs(obs))) / 2
 
-    return dataclasses.replace(
-        nets,
+    return nets.replace(  # pyright: ignore[reportAttributeAccessIssue]
         policy_network=dataclasses.replace(nets.policy_network, apply=policy),
         value_network=dataclasses.replace(nets.value_network, apply=value),
     )

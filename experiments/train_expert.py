@@ -214,7 +214,7 @@ def train_stage(task: Task, folder: Path, *, num_timesteps: int, evaluate_every:
     train.train(
         environment=task,
         num_timesteps=remaining,
-        episode_length=task.training.episode_length,
+        episode_length=task.stage.episode_length or task.training.episode_length,
         normalize_observations=True,
         network_factory=network_factory(task.training, task.stage.mirror),
         num_evals=max(2, 1 + remaining // evaluate_every),
@@ -251,9 +251,7 @@ def as_weights(params, training: Training) -> dict[str, np.ndarray]:
     layers = [*layers, modules["Dense_0"]] if clipped else layers
     mirror = training.stages[-1].mirror
     layers = layers if mirror is None else with_mirror_image(layers, statistics, mirror)
-    gains = np.ones(statistics.mean.shape, np.float32)
-    gains[list(training.gains)] = list(training.gains.values())
-    weights: dict[str, Any] = {"obs_mean": statistics.mean / gains, "obs_std": statistics.std / gains}
+    weights: dict[str, Any] = {"obs_mean": statistics.mean, "obs_std": statistics.std}
     for i, layer in enumerate(layers):
         actions = layer["bias"].size // 2 if layer is layers[-1] and not clipped else None  # the other half are their scales
         weights[f"kernel_{i}"], weights[f"bias_{i}"] = layer["kernel"][:, :actions], layer["bias"][:actions]

@@ -34,6 +34,7 @@ class Stage(NamedTuple):
         options: what `Training.make_env` is given.
         noise: standard deviation that actions of a `CLIPPED_NORMAL` policy have at the beginning; None leaves what it was.
         vary: `(EnvState, key) -> EnvState`, a disturbance before each training step.
+        episode_length: where given, in place of the training's.
         mirror: where given, the policy is the mean of what it does and of what its mirror image does.
     """
 
@@ -43,6 +44,7 @@ class Stage(NamedTuple):
     options: Mapping[str, Any] = {}
     noise: float | None = None
     vary: Callable[[EnvState, jax.Array], EnvState] = lambda state, key: state
+    episode_length: int | None = None
     mirror: Mirror | None = None
 
 
@@ -56,11 +58,9 @@ class Training(NamedTuple):
         stages: one after the other.
         hidden_sizes: units of the hidden layers of policy and value network.
         network: what else brax's networks are built with.
-        episode_length: of training, in control steps.
+        episode_length: of training, in control steps; a stage may have its own.
         step_size: where given, the policy's outputs times this are added to the last action, which is the observation's end.
         view: what the networks see of an observation.
-        gains: how much larger than they are the shipped policy sees entries of the observation: a robot that turns a tenth
-            less than it is told is told a tenth more.
     """
 
     make_env: Callable[..., Env]
@@ -72,7 +72,6 @@ class Training(NamedTuple):
     network: Mapping[str, Any] = {}
     step_size: float | None = None
     view: expert.View = expert.everything
-    gains: Mapping[int, float] = {}
 
 
 def progress(before: EnvState, after: EnvState) -> jax.Array:
@@ -236,13 +235,16 @@ TRAININGS = {
             # Goals came hardly faster now. Back to what is learnt fast, with twice as many updates, and on from there.
             Stage(TURNING | MORE_UPDATES, turning, options={"tolerance": 0.4}, begins=33_000_000),
             Stage(TURNING | MORE_UPDATES, turning, options={"tolerance": 0.2}, begins=40_000_000),
+            Stage(TURNING | MORE_UPDATES, turning, begins=46_000_000, noise=0.3),
+            # From here on the view has the small turns on a scale of their own (entries 66 to 68, unused before).
+            Stage(TURNING | MORE_UPDATES, turning, begins=49_000_000, noise=0.4),
+            Stage(TURNING | SMALL_STEPS | {"entropy_cost": 0.0}, turning, begins=58_000_000),
         ),
     ),
     "anymal": Training(
         make_env=functools.partial(anymal.make_env, success_return=math.inf),
         success_floor=anymal.SUCCESS_FLOOR,
         measure=("mean_tracking_error", anymal.tracking_error),
-        gains={9: 0.98, 10: 1.02, 11: 1.06},  # the command
         network=CLIPPED_NORMAL,
         episode_length=1000,
         # The first 6 million steps ran with two iterations of the solver, the rest with the model's ten.
@@ -266,6 +268,17 @@ TRAININGS = {
             ),
             # Half the misses were gone, but now the slowest robots fell.
             Stage(LARGE_BATCHES | FINE | {"desired_kl": 0.01}, sure_walking, begins=62_000_000, vary=EXTREME, mirror=SIDES),
+            Stage(LARGE_BATCHES | FINE | SMALL_STEPS, sure_walking, begins=66_000_000, noise=0.1, vary=EXTREME, mirror=SIDES),
+            # What falls were left happened within two seconds of a start: more starts.
+            Stage(
+                LARGE_BATCHES | FINE | {"desired_kl": 0.01},
+                sure_walking,
+                begins=67_500_000,
+                noise=0.12,
+                vary=EXTREME,
+                episode_length=200,
+                mirror=SIDES,
+            ),
         ),
     ),
     "humanoid": Training(

@@ -255,9 +255,10 @@ def test_the_view_entry_by_entry(turned):
     left = goal * cube.inv()
     np.testing.assert_allclose(view[62:65], left.as_rotvec(), atol=1e-5)
     np.testing.assert_allclose(view[65], left.magnitude(), atol=1e-5)
-    np.testing.assert_array_equal(view[66:], obs[0, 72:])
+    np.testing.assert_allclose(view[66:69], left.as_rotvec() / (left.magnitude() + 0.1), atol=1e-5)
+    np.testing.assert_array_equal(view[69:], obs[0, 72:])
 
 
 def test_the_view_at_the_goal_is_finite(physics):
     obs = allegro_hand.observe(hand(physics, turn=NO_TURN, goal=NO_TURN), jnp.zeros(16), LOW, HIGH)
-    np.testing.assert_allclose(allegro_hand.view(obs)[62:66], 0, atol=1e-6)
+    np.testing.assert_allclose(allegro_hand.view(obs)[62:69], 0, atol=1e-6)

@@ -135,9 +135,9 @@ def observe(hand: Hand, action: jax.Array, low: jax.Array, high: jax.Array) -> j
     return jnp.clip(jnp.concatenate(entries), -5.0, 5.0)
 
 
-@functools.partial(jnp.vectorize, signature="(88)->(82)")
+@functools.partial(jnp.vectorize, signature="(88)->(85)")
 def view(obs: jax.Array) -> jax.Array:
-    """Return what the expert sees f32[..., 82] of an observation f32[..., 88].
+    """Return what the expert sees f32[..., 85] of an observation f32[..., 88].
 
     A cube that is turned onto itself lies in the hand as before, and what is left to turn does not change: of its
     orientation only how edges lie matters, not which face is where. So a policy that sees the turn to the goal in the
@@ -145,7 +145,8 @@ def view(obs: jax.Array) -> jax.Array:
 
     Entries: 0-31 joint angles and velocities; 32-34 the cube's distance from the goal's position; 35-49 fourth moments of its
     edges' directions; 50-55 the edge nearest to the world's x and the one nearest to its z, each as a unit vector; 56-61
-    velocity and angular velocity; 62-64 the turn that is left as a rotation vector (rad), 65 its angle; 66-81 the action.
+    velocity and angular velocity; 62-64 the turn that is left as a rotation vector (rad), 65 its angle; 66-68 the same vector
+    on a scale on which the last tenth of a radian is half of all; 69-84 the action.
     """
     orientation, missing = jnp.roll(obs[51:55], 1), conjugate(jnp.roll(obs[68:72], 1))
     edges = rotation_matrix(orientation)  # in columns
@@ -159,7 +160,8 @@ def view(obs: jax.Array) -> jax.Array:
     angle = 2.0 * jnp.arcsin(sine)
     turn = turn / jnp.maximum(sine, 1e-6) * angle
     position = obs[48:51] - obs[61:64]
-    return jnp.concatenate([obs[:32], position, moments, along_x, along_z, obs[55:61], turn, angle[None], obs[72:]])
+    fine = turn / (angle + TOLERANCE)
+    return jnp.concatenate([obs[:32], position, moments, along_x, along_z, obs[55:61], turn, angle[None], fine, obs[72:]])
 
 
 def _scalar_last(quaternion: jax.Array) -> jax.Array:

@@ -2,7 +2,6 @@
 
     python experiments/train_expert.py humanoid                 # train, or go on from the last checkpoint
     python experiments/train_expert.py humanoid --ship           # score the best checkpoints, write the package's weights
-    python experiments/train_expert.py anymal --output experiments/checkpoints/anymal    # go on where its training stands
 
 Every evaluation appends a row to `curve.csv` and writes a checkpoint (observation statistics, policy and value
 network; the optimizer starts afresh after an interruption). `--ship` scores the checkpoints with the

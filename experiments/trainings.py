@@ -236,7 +236,7 @@ TRAININGS = {
             Stage(TURNING | MORE_UPDATES, turning, options={"tolerance": 0.4}, begins=33_000_000),
             Stage(TURNING | MORE_UPDATES, turning, options={"tolerance": 0.2}, begins=40_000_000),
             Stage(TURNING | MORE_UPDATES, turning, begins=46_000_000, noise=0.3),
-            # From here on the view has the small turns on a scale of their own (entries 66 to 68, unused before).
+            # The 49 million steps before saw a view without entries 66 to 68, whose weights now began at zero.
             Stage(TURNING | MORE_UPDATES, turning, begins=49_000_000, noise=0.4),
             Stage(TURNING | SMALL_STEPS | {"entropy_cost": 0.0}, turning, begins=58_000_000),
         ),

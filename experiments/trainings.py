@@ -82,9 +82,9 @@ def progress(before: EnvState, after: EnvState) -> jax.Array:
     """
     del before
     linear, angular = anymal.base_velocity(after.physics.body)
-    command = after.physics.command
-    missed = jnp.linalg.norm(linear[:2] - command[:2]) / jnp.maximum(jnp.linalg.norm(command[:2]), 0.3)
-    turning_missed = jnp.abs(angular[2] - command[2]) / jnp.maximum(jnp.abs(command[2]), 0.3)
+    told = after.physics.command
+    missed = jnp.linalg.norm(linear[:2] - told[:2]) / jnp.maximum(jnp.linalg.norm(told[:2]), 0.3)
+    turning_missed = jnp.abs(angular[2] - told[2]) / jnp.maximum(jnp.abs(told[2]), 0.3)
     reached = jnp.maximum(1.25 - missed, 0.0) + 0.5 * jnp.maximum(1.25 - turning_missed, 0.0)
     return after.reward + 0.03 * reached
 
@@ -117,13 +117,16 @@ def hard_command(key: jax.Array) -> jax.Array:
     return jnp.sign(draw) * jnp.abs(draw) ** 0.4 * anymal.COMMAND_RANGE
 
 
+def command(state: EnvState, velocity: jax.Array) -> EnvState:
+    """Return ANYmal as it is, told another velocity f32[3]."""
+    walker = state.physics._replace(command=velocity)
+    return state._replace(physics=walker, obs=anymal.observe(walker, state.obs[36:]))
+
+
 def change_command(draw: Callable[[jax.Array], jax.Array], state: EnvState, key: jax.Array) -> EnvState:
     """Give ANYmal another command now and then, every 250 steps in the mean."""
     key_when, key_what = jax.random.split(key)
-    walker = state.physics
-    command = jnp.where(jax.random.uniform(key_when) < 1 / 250, draw(key_what), walker.command)
-    walker = walker._replace(command=command)
-    return state._replace(physics=walker, obs=anymal.observe(walker, state.obs[36:]))
+    return command(state, jnp.where(jax.random.uniform(key_when) < 1 / 250, draw(key_what), state.physics.command))
 
 
 def fast_command(key: jax.Array) -> jax.Array:
@@ -140,9 +143,7 @@ def extreme_command(key: jax.Array) -> jax.Array:
 
 def begin_with(draw: Callable[[jax.Array], jax.Array], state: EnvState, key: jax.Array) -> EnvState:
     """Give ANYmal another command for each episode, as the task does."""
-    walker = state.physics
-    walker = walker._replace(command=jnp.where(state.episode_step == 0, draw(key), walker.command))
-    return state._replace(physics=walker, obs=anymal.observe(walker, state.obs[36:]))
+    return command(state, jnp.where(state.episode_step == 0, draw(key), state.physics.command))
 
 
 def mirrored_joints(values: jax.Array) -> jax.Array:
@@ -204,6 +205,7 @@ TURNING = LARGE_BATCHES | {
 MORE_UPDATES = {"num_envs": 1024, "batch_size": 256}
 SMALL_STEPS = {"learning_rate": 3e-5, "desired_kl": 0.006}
 FINE = {"discounting": 0.99, "reward_scaling": 5.0, "entropy_cost": 0.0}
+WALKING = LARGE_BATCHES | FINE | {"desired_kl": 0.01}
 EASY = functools.partial(change_command, easy_command)
 HARD = functools.partial(change_command, hard_command)
 FAST = functools.partial(begin_with, fast_command)
@@ -251,34 +253,19 @@ TRAININGS = {
         stages=(
             Stage(LARGE_BATCHES | {"discounting": 0.98, "reward_scaling": 3.0}, progress, vary=EASY),
             Stage(LARGE_BATCHES | FINE, calm_walking, begins=10_000_000, noise=0.3, vary=EASY),
-            Stage(LARGE_BATCHES | FINE | SMALL_STEPS, sure_walking, begins=18_000_000, noise=0.12, vary=EASY),
-            Stage(LARGE_BATCHES | FINE | {"desired_kl": 0.01}, sure_walking, begins=25_000_000, noise=0.2, vary=EASY),
-            Stage(LARGE_BATCHES | FINE | SMALL_STEPS, sure_walking, begins=32_000_000, noise=0.1, vary=EASY),
-            Stage(LARGE_BATCHES | FINE | {"desired_kl": 0.01}, sure_walking, begins=35_500_000, noise=0.2, vary=HARD),
-            Stage(LARGE_BATCHES | FINE | SMALL_STEPS, sure_walking, begins=46_000_000, noise=0.1, vary=HARD),
-            Stage(LARGE_BATCHES | FINE | {"desired_kl": 0.01}, sure_walking, begins=52_000_000, noise=0.15, vary=HARD),
+            Stage(WALKING | SMALL_STEPS, sure_walking, begins=18_000_000, noise=0.12, vary=EASY),
+            Stage(WALKING, sure_walking, begins=25_000_000, noise=0.2, vary=EASY),
+            Stage(WALKING | SMALL_STEPS, sure_walking, begins=32_000_000, noise=0.1, vary=EASY),
+            Stage(WALKING, sure_walking, begins=35_500_000, noise=0.2, vary=HARD),
+            Stage(WALKING | SMALL_STEPS, sure_walking, begins=46_000_000, noise=0.1, vary=HARD),
+            Stage(WALKING, sure_walking, begins=52_000_000, noise=0.15, vary=HARD),
             # Above 1.6 m/s a third of the episodes still cost too much torque: the gait loads one hind leg more than the other.
-            Stage(
-                LARGE_BATCHES | FINE | {"desired_kl": 0.01},
-                sure_walking,
-                begins=58_000_000,
-                noise=0.2,
-                vary=FAST,
-                mirror=SIDES,
-            ),
+            Stage(WALKING, sure_walking, begins=58_000_000, noise=0.2, vary=FAST, mirror=SIDES),
             # Half the misses were gone, but now the slowest robots fell.
-            Stage(LARGE_BATCHES | FINE | {"desired_kl": 0.01}, sure_walking, begins=62_000_000, vary=EXTREME, mirror=SIDES),
-            Stage(LARGE_BATCHES | FINE | SMALL_STEPS, sure_walking, begins=66_000_000, noise=0.1, vary=EXTREME, mirror=SIDES),
+            Stage(WALKING, sure_walking, begins=62_000_000, vary=EXTREME, mirror=SIDES),
+            Stage(WALKING | SMALL_STEPS, sure_walking, begins=66_000_000, noise=0.1, vary=EXTREME, mirror=SIDES),
             # What falls were left happened within two seconds of a start: more starts.
-            Stage(
-                LARGE_BATCHES | FINE | {"desired_kl": 0.01},
-                sure_walking,
-                begins=67_500_000,
-                noise=0.12,
-                vary=EXTREME,
-                episode_length=200,
-                mirror=SIDES,
-            ),
+            Stage(WALKING, sure_walking, begins=67_500_000, noise=0.12, vary=EXTREME, episode_length=200, mirror=SIDES),
         ),
     ),
     "humanoid": Training(

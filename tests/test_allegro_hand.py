@@ -238,6 +238,14 @@ def test_the_view_is_the_same_for_a_cube_turned_onto_itself(turned):
     np.testing.assert_allclose(np.ptp(allegro_hand.view(obs), axis=0), 0, atol=2e-6)
 
 
+def test_the_view_is_the_same_for_both_quaternions_of_a_turn(turned):
+    obs = turned[2][0]
+    for entries in (slice(51, 55), slice(68, 72)):
+        other = obs.copy()
+        other[entries] *= -1
+        np.testing.assert_allclose(allegro_hand.view(other), allegro_hand.view(obs), atol=2e-6)
+
+
 def test_the_view_entry_by_entry(turned):
     cube, goal, obs = turned
     view = np.asarray(allegro_hand.view(obs[0]))

@@ -43,6 +43,22 @@ def test_weights_act_as_brax_does(name):
     assert np.std(action) > 0.1
 
 
+def test_symmetric_networks_treat_a_mirror_image_as_the_robot():
+    training, nets, (statistics, policy, _) = trained("anymal")
+    mirror = training.stages[-1].mirror
+    assert mirror is not None
+    value = nets.value_network.init(jax.random.key(4))
+    obs = 5.0 * jax.random.normal(jax.random.key(3), (40, 48))
+    mean, deviation = nets.policy_network.apply(statistics, policy, obs)
+    mean_mirrored, deviation_mirrored = nets.policy_network.apply(statistics, policy, mirror.obs(obs))
+    np.testing.assert_allclose(mean_mirrored, mirror.action(mean), atol=2e-5)
+    np.testing.assert_allclose(deviation_mirrored, np.abs(mirror.action(deviation)), atol=2e-5)
+    worth = nets.value_network.apply(statistics, value, obs)
+    np.testing.assert_allclose(nets.value_network.apply(statistics, value, mirror.obs(obs)), worth, atol=2e-5)
+    assert np.std(mean) > 0.1
+    assert np.std(worth) > 0.1
+
+
 def test_a_mirror_image_does_the_mirrored_thing_in_the_task_as_well():
     mirror, task = TRAININGS["anymal"].stages[-1].mirror, envs.make("anymal", "native")
     assert mirror is not None

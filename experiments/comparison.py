@@ -52,14 +52,22 @@ def run_missing(cases: Iterable[Case], output: Path) -> list[tuple[Config, int, 
 
 def table(data: list[tuple[Config, int, Metrics]]) -> str:
     """Return a Markdown table, a row for each environment and algorithm: means over seeds, and their deviation if several."""
-    head = f"| environment | algorithm | {' | '.join(COLUMNS.values())} | ROHE |\n|---|---|{(len(COLUMNS) + 1) * '---:|'}"
-    rows = [head]
+    head = ["environment", "algorithm", *COLUMNS.values(), "late successes", "ROHE"]
+    rows = [head, ["---", "---"] + ["---:"] * (len(head) - 2)]
     for environment, algorithm in dict.fromkeys((config.environment, config.algorithm) for config, _, _ in data):
-        seeds = [(c, text.add_up(m)) for c, _, m in data if (c.environment, c.algorithm) == (environment, algorithm)]
-        cells = [_shown([total[name] for _, total in seeds], 0) for name in COLUMNS]
-        cells.append(_shown([text.rohe_of(total, config) for config, total in seeds], 3))
-        rows.append("| " + " | ".join([environment, text.label(algorithm), *cells]) + " |")
-    return "\n".join(rows)
+        runs = [(c, m) for c, _, m in data if (c.environment, c.algorithm) == (environment, algorithm)]
+        totals = [text.add_up(m) for _, m in runs]
+        cells = [_shown([total[name] for total in totals], 0) for name in COLUMNS]
+        late = _shown([_late_successes(m) for _, m in runs], 0)
+        return_ = _shown([text.rohe_of(total, config) for (config, _), total in zip(runs, totals, strict=True)], 3)
+        rows.append([environment, text.label(algorithm), *cells, late, return_])
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def _late_successes(metrics: Metrics) -> float:
+    """Return how many successes fell into the last quarter of a run, when most is learnt."""
+    length = len(metrics.successes)
+    return float(np.sum(metrics.successes[length - length // 4 :]))
 
 
 def _shown(values: list[float], digits: int) -> str:

@@ -66,6 +66,19 @@ def test_the_band_is_one_standard_deviation_about_the_mean(config):
     assert [ax.get_title(loc="left") for ax in axes] == list(figure.PANELS)
 
 
+def test_returns_of_different_size_are_told_apart(config):
+    few, many = make_metrics(0), make_metrics(0)._replace(successes=20 * make_metrics(0).successes)
+    returns = [figure.curves_of(metrics, config)[3, -1] for metrics in (few, many)]
+    rule = fleetjax.make_config("navigation", "uc")
+    apart = figure.draw(figure.group([(config, 0, few), (rule, 0, many)])).axes
+    assert [ax.get_yscale() for ax in apart] == ["linear"] * 3 + ["log"]
+    low, high = apart[3].get_ylim()
+    assert 0 < low < returns[0]
+    assert high > returns[1] > 10 * returns[0]
+    alike = figure.draw(figure.group([(config, 0, few), (rule, 0, few)])).axes
+    assert alike[3].get_yscale() == "linear"
+
+
 def test_every_line_of_a_figure_can_be_told_apart(config):
     names = ["cur", "constraint", "random", "ensemble_dagger", "thrifty_dagger", "uc", "c", "u", "r"]
     runs = [(fleetjax.make_config("navigation", name), 0, make_metrics()) for name in names]

@@ -139,6 +139,7 @@ def draw(groups: Sequence[Curves], title: str = "") -> Figure:
                         ax.fill_between(t, mean - deviation, mean + deviation, color=colour, alpha=0.2, linewidth=0)
                 ax.set_xlim(0, max(curves.values.shape[2] for curves, _ in here))
                 ax.set_ylim(bottom=0)
+            _spread_returns(row[-1], [curves.values[:, -1, -1].mean() for curves, _ in here])
             if len(places) > 1:
                 row[0].set_ylabel(place, fontsize=10)
         if title:  # it says what the only line is
@@ -170,6 +171,13 @@ def _prepare_axes(ax: Axes, name: str) -> None:
     ax.yaxis.set_major_locator(MaxNLocator(5, integer=name != PANELS[3], steps=[1, 2, 2.5, 5, 10]))
     if name != PANELS[3]:
         ax.yaxis.set_major_formatter(counts)
+
+
+def _spread_returns(ax: Axes, ends: Sequence[float]) -> None:
+    """Give the returns a logarithmic axis where the lower ones would lie on a linear one's bottom."""
+    if 0 < 10 * min(ends) < max(ends):
+        ax.set_yscale("log")
+        ax.set_ylim(min(ends) / 10, 2 * max(ends))
 
 
 def _styles(groups: Sequence[Curves]) -> list[tuple[str, Any]]:

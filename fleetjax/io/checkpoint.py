@@ -83,7 +83,8 @@ class Writer:
         except Exception as error:  # orbax passes on what its storage raises, of any kind
             shutil.rmtree(path, ignore_errors=True)
             raise OSError(f"the checkpoint at t = {timestep} could not be written ({files.one_line(error)})") from error
-        for old in sorted(self.folder.iterdir())[:-KEPT]:
+        found = sorted(self.folder.iterdir())
+        for old in set(found) - set([kept for kept in found if (kept / MANIFEST).exists()][-KEPT:]):
             shutil.rmtree(old)
 
 

@@ -1,9 +1,10 @@
 """What the benchmarks share: a fleet that can be timed in stretches, and the machine's rate for a large matrix product."""
 
+import argparse
 import itertools
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 import jax
@@ -29,6 +30,19 @@ ROBOTS: dict[str, tuple[int, Callable[[jax.Array, mujoco.MjModel], jax.Array]]] 
 
 
 REGISTERED = [name for name in ROBOTS if name in fleetjax.list_envs()]
+
+
+def add_names(parser: argparse.ArgumentParser, dest: str, known: Collection[str]) -> None:
+    """Let a script be told names out of those that are known; without any it takes all."""
+
+    def check(name: str) -> str:  # in place of `choices`, which would be asked for the default as a whole
+        if name not in known:
+            raise argparse.ArgumentTypeError(f"{name!r} is none of {', '.join(known)}")
+        return name
+
+    parser.add_argument(
+        dest, nargs="*", type=check, default=list(known), help=f"out of {', '.join(known)}; all if none is given"
+    )
 
 
 def seconds(function: Callable[..., Any], *args: Any) -> tuple[float, Any]:

@@ -13,7 +13,7 @@ import statistics
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import REGISTERED, RawRollout, body_of, gradient_step_operations, matrix_rate, seconds, stretch, table
+from common import REGISTERED, RawRollout, add_names, body_of, gradient_step_operations, matrix_rate, seconds, stretch, table
 
 import fleetjax
 
@@ -63,11 +63,11 @@ def measure(environment: str, *, num_steps: int, repeats: int) -> dict[str, str]
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("environments", nargs="*", choices=[*REGISTERED, []], default=[], metavar="ENVIRONMENT")
+    add_names(parser, "environments", REGISTERED)
     parser.add_argument("--steps", type=int, default=200, help="timesteps in a timed stretch")
     parser.add_argument("--repeats", type=int, default=7, help="timed stretches")
     args = parser.parse_args()
-    print(table([measure(name, num_steps=args.steps, repeats=args.repeats) for name in args.environments or REGISTERED]))
+    print(table([measure(name, num_steps=args.steps, repeats=args.repeats) for name in args.environments]))
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from common import REGISTERED, RawRollout, body_of, seconds, table
+from common import REGISTERED, RawRollout, add_names, body_of, seconds, table
 
 import fleetjax
 from fleetjax.physics.base import make_physics
@@ -64,13 +64,13 @@ def measure(environment: str, num_robots: int, *, backends: list[str], repeats: 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("environments", nargs="*", choices=[*REGISTERED, []], default=[], metavar="ENVIRONMENT")
+    add_names(parser, "environments", REGISTERED)
     parser.add_argument("--num-robots", type=int, nargs="+", default=[100, 1000])
     parser.add_argument("--largest-mjx", type=int, default=100, help="largest batch on mjx (more wants a GPU)")
     parser.add_argument("--repeats", type=int, default=5)
     args = parser.parse_args()
     rows = []
-    for environment in args.environments or REGISTERED:
+    for environment in args.environments:
         for n in args.num_robots:
             backends = ["native", "mjx"] if n <= args.largest_mjx else ["native"]
             rows += measure(environment, n, backends=backends, repeats=args.repeats)

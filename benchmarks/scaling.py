@@ -9,7 +9,7 @@ import argparse
 from typing import Any
 
 import jax
-from common import REGISTERED, median_seconds, quick_config, step_milliseconds, table
+from common import REGISTERED, add_names, median_seconds, quick_config, step_milliseconds, table
 
 import fleetjax
 
@@ -78,11 +78,11 @@ def main() -> None:
     """Run the parts that are asked for."""
     parts = {"robots": robots, "humans": humans, "capacity": capacity, "seeds": seeds}
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", choices=[*parts, []], default=[], metavar="PART")
+    add_names(parser, "parts", parts)
     parser.add_argument("--largest-mjx", type=int, default=100, help="largest fleet on mjx (10 000 wants a GPU)")
     parser.add_argument("--largest-navigation", type=int, default=1_000_000)
     args = parser.parse_args()
-    for name in args.parts or parts:
+    for name in args.parts:
         print(f"\n{name}: {parts[name].__doc__}")
         parts[name](*((args.largest_mjx, args.largest_navigation) if name == "robots" else ()))
 

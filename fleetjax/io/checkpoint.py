@@ -84,8 +84,10 @@ class Writer:
             shutil.rmtree(path, ignore_errors=True)
             raise OSError(f"the checkpoint at t = {timestep} could not be written ({files.one_line(error)})") from error
         found = sorted(self.folder.iterdir())
-        for old in set(found) - set([kept for kept in found if (kept / MANIFEST).exists()][-KEPT:]):
-            shutil.rmtree(old)
+        kept = [whole for whole in found if (whole / MANIFEST).exists()][-KEPT:]
+        for other in found:
+            if other not in kept:
+                shutil.rmtree(other)
 
 
 def restore(

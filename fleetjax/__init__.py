@@ -7,7 +7,7 @@ from fleetjax.envs import Env, EnvSpec, list_envs, register_env
 from fleetjax.fleet import Fleet, FleetState, Interventions, Plan, make_fleet
 from fleetjax.metrics import Metrics, first_divergence, rohe
 from fleetjax.priority import Algorithm, Priority, list_algorithms, register_algorithm, register_priority
-from fleetjax.run import Result, evaluate, prepare, run, run_logged
+from fleetjax.run import Result, evaluate, extend, prepare, run, run_logged
 from fleetjax.supervisors import Supervisor, list_supervisors, register_supervisor
 from fleetjax.types import EnvState, HumanState, Signals
 from fleetjax.version import VERSION
@@ -32,6 +32,7 @@ __all__ = [
     "allocate",
     "envs",
     "evaluate",
+    "extend",
     "first_divergence",
     "list_algorithms",
     "list_envs",

@@ -5,6 +5,7 @@ paper's (Section 5.2 and Appendix); environments change some of them, see `fleet
 """
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -88,26 +89,29 @@ class Config:
     goal_discount: float = _traced(0.999, "discount of the goal critic", high=1)
     target_rate: float = _traced(2e-4, "rate at which target networks follow, each gradient step", high=1)
 
+    capacity_given: bool = False  # whether `human_capacity` was asked for; else it follows from the other fields
+
     def replace(self, **changes: Any) -> "Config":
         """Return a config with some fields changed; traced ones become i32, f32 or bool scalars.
 
         Raises:
-            ValueError: if a field is unknown or an integer field gets a value that is none.
+            ValueError: if a field is unknown, an integer field gets a value that is none, or the number of demonstrations is
+                traced and no `human_capacity` says how many pairs there may be.
         """
         for name in changes:
             if name not in FIELDS:
                 raise ValueError(priority.unknown("config field", name, FIELDS))
         changed = dataclasses.replace(self, **{name: _typed(name, value) for name, value in changes.items()})
-        if "human_capacity" in changes and changed.human_capacity:
-            return changed
-        return dataclasses.replace(changed, human_capacity=max(changed.human_capacity, needed_human_capacity(changed)))
+        return _with_capacity(self, changed, changes)
 
 
-FIELDS: dict[str, Field] = {f.name: f.metadata["field"] for f in dataclasses.fields(Config)}
+FIELDS: dict[str, Field] = {f.name: f.metadata["field"] for f in dataclasses.fields(Config) if "field" in f.metadata}
 _LARGEST = 2**31 - 1
+_LARGEST_EXACT = 2**24  # beyond it f32 skips whole numbers
+_OFFLINE = ("num_demonstrations", "extra_demonstrations")
 _TRACED = [name for name, field in FIELDS.items() if field.traced]
 _STATIC = [name for name, field in FIELDS.items() if not field.traced]
-jax.tree_util.register_dataclass(Config, data_fields=_TRACED, meta_fields=_STATIC)
+jax.tree_util.register_dataclass(Config, data_fields=_TRACED, meta_fields=[*_STATIC, "capacity_given"])
 
 
 def _typed(name: str, value: Any) -> Any:
@@ -138,36 +142,88 @@ def _is_integer(value: Any) -> bool:
 
 
 def _as_array(name: str, value: Any) -> jax.Array:
-    field = FIELDS[name]
-    try:
-        array = jnp.asarray(value)
-        if isinstance(value, (list, tuple)) or not array.size:  # arrays are sweeps
-            raise TypeError
-    except OverflowError:
-        raise ValueError(f"{name} = {value!r} must lie within 32 bits") from None
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} = {value!r} must be a number") from None
-    if field.kind is int and not jnp.issubdtype(array.dtype, jnp.integer):
-        whole = _is_concrete(array) and np.all(np.asarray(array) == np.round(np.asarray(array)))
-        if not whole:
-            raise ValueError(f"{name} = {value!r} must be a whole number of {field.unit}")
-    if field.kind is bool and array.dtype != jnp.bool_:
-        raise ValueError(f"{name} = {value!r} must be True or False")
-    return array.astype({int: jnp.int32, float: jnp.float32, bool: jnp.bool_}[field.kind])
+    kind = FIELDS[name].kind
+    array = value if isinstance(value, jax.Array) else np.asarray(value)
+    is_bool, is_int, is_float = (jnp.issubdtype(array.dtype, t) for t in (jnp.bool_, jnp.integer, jnp.floating))
+    if kind is bool:
+        if not is_bool:
+            raise ValueError(f"{name} = {value!r} must be True or False")
+        return _on_device(array, jnp.bool_)
+    if isinstance(value, (list, tuple)) or not array.size or not (is_int or is_float):  # arrays are sweeps
+        huge = isinstance(value, int) and not isinstance(value, bool)  # beyond what NumPy holds
+        raise ValueError(f"{name} = {value!r} must {'lie within 32 bits' if huge else 'be a number'}")
+    if kind is int:
+        _check_whole(name, array)
+    return _on_device(array, jnp.int32 if kind is int else jnp.float32)
+
+
+def _on_device(array: "jax.Array | np.ndarray", dtype: Any) -> jax.Array:
+    """Return numbers as JAX's, known ones as known: within a trace, `jnp.asarray` would make a tracer of them."""
+    if not _is_concrete(array):
+        return jnp.asarray(array, dtype)
+    with jax.ensure_compile_time_eval(), np.errstate(over="ignore"):  # what becomes infinite is out of range
+        return jnp.asarray(array, dtype)
+
+
+def _check_whole(name: str, array: "jax.Array | np.ndarray") -> None:
+    """Check that numbers are whole and lie within 32 bits.
+
+    Raises:
+        ValueError: if they do not, or are floats so large that they may stand for another whole number.
+    """
+    is_float = jnp.issubdtype(array.dtype, jnp.floating)
+    values = np.asarray(array, np.float64) if _is_concrete(array) else None
+    if is_float and (values is None or not np.all(np.isfinite(values) & (values == np.round(values)))):
+        raise ValueError(f"{name} = {array} must be a whole number of {FIELDS[name].unit}")
+    if values is not None and np.any(np.abs(values) > _LARGEST):
+        raise ValueError(f"{name} = {array} must lie within 32 bits")
+    if is_float and np.any(np.abs(values) > _LARGEST_EXACT):
+        raise ValueError(f"{name} = {array} is a float beyond 2^24, where floats skip whole numbers; pass an int")
 
 
 def _is_concrete(value: Any) -> bool:
     return not isinstance(value, Tracer)
 
 
+def taught_pairs(config: Config) -> int:
+    """Return how many pairs humans can add while the fleet runs, augmented copies included."""
+    updates = priority.get_algorithm(config.algorithm).updates
+    return config.augmented_copies * config.num_humans * config.num_steps if updates else 0
+
+
 def needed_human_capacity(config: Config) -> int:
     """Return how many pairs a run can collect; demonstrations count where they are concrete."""
-    algorithm = priority.get_algorithm(config.algorithm)
-    pairs = config.num_humans * config.num_steps if algorithm.updates else 0
-    offline = (config.num_demonstrations, config.extra_demonstrations)
-    if algorithm.pretrains and all(map(_is_concrete, offline)):
-        pairs += int(np.max(np.asarray(offline[0]) + np.asarray(offline[1])))
-    return max(config.augmented_copies * pairs, 1)
+    offline = 0
+    if priority.get_algorithm(config.algorithm).pretrains and _has_concrete_offline(config):
+        offline = int(np.max(np.asarray(config.num_demonstrations) + np.asarray(config.extra_demonstrations)))
+    return max(config.augmented_copies * offline + taught_pairs(config), 1)
+
+
+def _has_concrete_offline(config: Config) -> bool:
+    return all(_is_concrete(getattr(config, name)) for name in _OFFLINE)
+
+
+def _with_capacity(before: Config, after: Config, changes: Mapping[str, Any]) -> Config:
+    """Return `after` with room for the human data of a run: what was asked for, or what follows from the other fields.
+
+    Raises:
+        ValueError: if it would follow from a number of demonstrations that is traced.
+    """
+    if changes.get("human_capacity"):
+        return dataclasses.replace(after, capacity_given=True)
+    needed = needed_human_capacity(after)
+    if after.capacity_given and "human_capacity" not in changes:
+        return dataclasses.replace(after, human_capacity=max(after.human_capacity, needed))
+    if _has_concrete_offline(after) or not priority.get_algorithm(after.algorithm).pretrains:
+        return dataclasses.replace(after, human_capacity=needed, capacity_given=False)
+    for name in _OFFLINE:
+        if name in changes and not _is_concrete(getattr(after, name)):
+            raise ValueError(
+                f"{name} is traced, so the room for human data cannot follow from it; pass human_capacity as well, the most "
+                f"pairs that a run can hold: the largest number of demonstrations and {taught_pairs(after)} of teleoperation"
+            )
+    longer = max(0, taught_pairs(after) - taught_pairs(before))
+    return dataclasses.replace(after, human_capacity=before.human_capacity + longer)
 
 
 def make_config(environment: "str | envs.Env", algorithm: str = "cur", **overrides: Any) -> Config:
@@ -192,7 +248,7 @@ def make_config(environment: "str | envs.Env", algorithm: str = "cur", **overrid
     else:
         name, defaults = environment, envs.get_defaults(environment)
     priority.get_algorithm(algorithm)
-    fields: dict[str, Any] = {f.name: f.default for f in dataclasses.fields(Config)} | dict(defaults)
+    fields: dict[str, Any] = {name: getattr(Config, name) for name in FIELDS} | dict(defaults)
     fields |= {"environment": name, "algorithm": algorithm} | overrides
     if algorithm == "expert" and "num_humans" not in overrides:
         fields["num_humans"] = fields["num_robots"]
@@ -237,7 +293,7 @@ def validate(config: Config, env: "envs.Env | None" = None) -> None:
     if algorithm.pretrains or algorithm.updates:
         _check_data(config, algorithm)
     env = env or envs.make(config.environment, config.backend)
-    supervisors.check(config.supervisor or env.spec.supervisor)
+    supervisors.check(config.supervisor or env.spec.supervisor, env)
     if config.augmented_copies > 1 and not env.spec.image_shape:
         raise ValueError(
             f"augmented_copies = {config.augmented_copies} needs images, and environment = {env.spec.name!r} has none; "
@@ -263,13 +319,12 @@ def _check_range(name: str, value: Any, field: Field) -> None:
 
 
 def _check_data(config: Config, algorithm: priority.Algorithm) -> None:
-    if not all(map(_is_concrete, (config.num_demonstrations, config.extra_demonstrations))):
-        return
-    pairs = np.min(np.asarray(config.num_demonstrations) + np.asarray(config.extra_demonstrations))
-    if algorithm.pretrains and config.batch_size > pairs:
-        raise ValueError(
-            f"batch_size = {config.batch_size} is larger than the data: num_demonstrations + extra_demonstrations = {pairs}"
-        )
+    if algorithm.pretrains and _has_concrete_offline(config):
+        pairs = np.min(np.asarray(config.num_demonstrations) + np.asarray(config.extra_demonstrations))
+        if config.batch_size > pairs:
+            raise ValueError(
+                f"batch_size = {config.batch_size} is larger than the data: num_demonstrations + extra_demonstrations = {pairs}"
+            )
     needed = needed_human_capacity(config)
     if max(needed, config.human_capacity) > _LARGEST:
         raise ValueError(

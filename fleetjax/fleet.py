@@ -4,6 +4,7 @@
 them. This is the only module that maps over robots.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -17,9 +18,19 @@ from fleetjax.config import Config
 from fleetjax.envs import Env
 from fleetjax.learning import critic, imitation
 from fleetjax.metrics import Metrics
+from fleetjax.precision import in_32_bits
 from fleetjax.types import EnvState, HumanState, Signals
 
 CRITICS = ("safety", "goal")  # in the order of `metrics.LEARNT`
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class Origin:
+    """The names of the environment and the algorithm that a state was prepared for; "" = not known."""
+
+    environment: str
+    algorithm: str
 
 
 class FleetState(NamedTuple):
@@ -34,6 +45,7 @@ class FleetState(NamedTuple):
         human_data: what it learns from.
         critics: `CriticState` by kind, those that the algorithm needs.
         priority: the priority's own memory.
+        origin: what it was prepared for.
     """
 
     timestep: jax.Array
@@ -44,6 +56,7 @@ class FleetState(NamedTuple):
     human_data: imitation.HumanData
     critics: dict[str, critic.CriticState]
     priority: Any
+    origin: Origin = Origin("", "")
 
 
 class Plan(NamedTuple):
@@ -113,6 +126,30 @@ class Fleet(NamedTuple):
     logged_step: Callable[[FleetState, jax.Array], tuple[FleetState, tuple[Metrics, Interventions]]]
 
 
+def init_state(
+    config: Config,
+    env: Env,
+    key: jax.Array,
+    policy: imitation.LearnerState,
+    data: imitation.HumanData,
+    critics: dict[str, critic.CriticState],
+) -> FleetState:
+    """Return the state at t = 0: robots freshly reset, humans free."""
+    robots = jnp.arange(config.num_robots)
+    return FleetState(
+        timestep=jnp.zeros((), jnp.int32),
+        env=jax.vmap(env.reset)(jax.random.split(key, config.num_robots), robots),
+        humans=HumanState(jnp.full(config.num_humans, -1, jnp.int32), jnp.zeros(config.num_humans, jnp.int32)),
+        resetting=jnp.zeros(config.num_robots, bool),
+        learner=policy,
+        human_data=data,
+        critics=critics,
+        priority=priority.get_algorithm(config.algorithm).make_priority(config).init(),
+        origin=Origin(env.spec.name, config.algorithm),
+    )
+
+
+@in_32_bits
 def make_fleet(config: Config, env: Env) -> Fleet:
     """Compose environment, policy, critics, priority and supervisor into the timestep of a fleet."""
     algorithm = priority.get_algorithm(config.algorithm)
@@ -188,8 +225,17 @@ def make_fleet(config: Config, env: Env) -> Fleet:
             policy, critic_states, loss = learn(policy, human_data, critic_states, key_learn)
 
         diverged = _diverged(policy, critic_states, state.priority)
-        metrics = _measure(config, state, plan, stepped, moving, reset_done, diverged, loss)
-        state = FleetState(state.timestep + 1, after, humans, plan.resetting, policy, human_data, critic_states, state.priority)
+        dropped = human_data.dropped - jnp.where(state.timestep > 0, state.human_data.dropped, 0)
+        metrics = _measure(config, state, plan, stepped, moving, reset_done, dropped, diverged, loss)
+        state = state._replace(
+            timestep=state.timestep + 1,
+            env=after,
+            humans=humans,
+            resetting=plan.resetting,
+            learner=policy,
+            human_data=human_data,
+            critics=critic_states,
+        )
         return state, metrics, stepped
 
     def logged_step(state: FleetState, key: jax.Array) -> tuple[FleetState, tuple[Metrics, Interventions]]:
@@ -203,7 +249,7 @@ def make_fleet(config: Config, env: Env) -> Fleet:
         after, (metrics, _) = logged_step(state, key)
         return after, metrics
 
-    return Fleet(plan, advance, step, logged_step)
+    return Fleet(*map(in_32_bits, (plan, advance, step, logged_step)))
 
 
 def _make_learning(config: Config, learner: imitation.Learner, critics: dict[str, critic.Critic]) -> Callable[..., Any]:
@@ -274,6 +320,7 @@ def _measure(
     stepped: EnvState,
     moving: jax.Array,
     reset_done: jax.Array,
+    dropped: jax.Array,
     diverged: jax.Array,
     loss: jax.Array,
 ) -> Metrics:
@@ -298,8 +345,10 @@ def _measure(
         moving=count(moving),
         choices=count(chosen),
         risk_choices=count(chosen & moving & certain & at_risk),
+        dropped=dropped,
         diverged=diverged,
         reward=jnp.sum(jnp.where(moving, stepped.reward, 0.0)),
-        uncertainty=jnp.sum(jnp.where(moving, plan.signals.uncertainty, 0.0)) / jnp.maximum(count(moving), 1),
+        uncertainty=jnp.sum(jnp.where(moving, plan.signals.uncertainty, 0.0))
+        / jnp.maximum(count(moving), 1).astype(jnp.float32),
         policy_loss=loss,
     )

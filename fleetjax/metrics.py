@@ -25,6 +25,7 @@ class Metrics(NamedTuple):
         moving: robots that acted.
         choices: robots newly given to a human.
         risk_choices: those of them that only their risk spoke for: no violation, uncertainty below its threshold.
+        dropped: pairs of human data for which there was no room; at t = 0 also those of the demonstrations.
         diverged: what of `LEARNT` holds numbers that are not finite, the sum of 1, 2, 4 and 8 for each; see `first_divergence`.
         reward: f32 sum of rewards over moving robots.
         uncertainty: f32 mean over moving robots.
@@ -41,6 +42,7 @@ class Metrics(NamedTuple):
     moving: jax.Array
     choices: jax.Array
     risk_choices: jax.Array
+    dropped: jax.Array
     diverged: jax.Array
     reward: jax.Array
     uncertainty: jax.Array

@@ -143,8 +143,8 @@ def thrifty_dagger(config) -> Priority:
         del key
         values = jnp.stack([signals.uncertainty, 1.0 - signals.goal], axis=1)
         moments = update_moments(moments, values)
-        deviation = jnp.sqrt(moments.squares / moments.number)
-        z = (values - moments.mean) / jnp.maximum(deviation, 1e-8)
+        variance = jnp.maximum(moments.squares / moments.number, 1e-16)  # below the root: a root's slope at 0 is infinite
+        z = (values - moments.mean) / jnp.sqrt(variance)
         combined = (1 - config.thrifty_weight) * z[:, 0] + config.thrifty_weight * z[:, 1]
         excess = jnp.maximum(combined - config.thrifty_threshold, 0.0)
         return lexicographic(excess, signals.violation), moments

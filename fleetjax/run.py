@@ -5,14 +5,16 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from fleetjax import envs, priority
-from fleetjax.config import Config, validate
-from fleetjax.fleet import Fleet, FleetState, Interventions, make_fleet
+from fleetjax import envs
+from fleetjax.checks import check_run, check_state
+from fleetjax.config import Config
+from fleetjax.fleet import Fleet, FleetState, Interventions, init_state, make_fleet
 from fleetjax.learning.imitation import LearnerState, create_data
 from fleetjax.learning.pretraining import pretrain
 from fleetjax.metrics import Metrics
-from fleetjax.types import HumanState
+from fleetjax.precision import in_32_bits
 
 
 class Result(NamedTuple):
@@ -27,6 +29,7 @@ class Result(NamedTuple):
     state: FleetState
 
 
+@in_32_bits
 def prepare(config: Config, key: jax.Array, env: envs.Env | None = None) -> FleetState:
     """Return the fleet at t = 0: demonstrations collected, policy and critics pre-trained, robots at their start.
 
@@ -35,52 +38,57 @@ def prepare(config: Config, key: jax.Array, env: envs.Env | None = None) -> Flee
         key: random key; `run(config, key)` starts from `prepare(config, key)`.
         env: the environment, if it is not the registered one that the configuration names.
 
+    Collecting whole episodes takes loops whose length depends on what happens in them, so there are forward derivatives
+    through this function and none in reverse; `run` from a given state has both.
+
     Raises:
-        ValueError: if the configuration is not valid.
+        ValueError: if the configuration is not valid, or the run cannot fit the memory.
 
     Reference: paper, Section 5.2.
     """
-    validate(config, env)
-    env = env or envs.make(config.environment, config.backend)
-
-    def start(config: Config, key: jax.Array) -> FleetState:
-        key_pretrain, key_reset = jax.random.split(key)
-        policy, data, critics = pretrain(config, env, key_pretrain)
-        return _start(config, env, key_reset, policy, data, critics)
-
+    env = check_run(config, env)
     key_prepare, _ = jax.random.split(key)
-    return _one_by_one(start)(config, key_prepare)
+    key_pretrain, key_reset = jax.random.split(key_prepare)
+    policy, data, critics = pretrain(config, env, key_pretrain)
+    return init_state(config, env, key_reset, policy, data, critics)
 
 
-def _one_by_one(function: Callable[..., Any]) -> Callable[..., Any]:
-    """On a CPU, let `vmap` call a function on one run after the other.
+def extend(state: FleetState, num_pairs: int) -> FleetState:
+    """Return the same state with room for more human data, for runs that go on from it.
 
-    Side by side, matrix products would be rounded differently, and a last bit decides who is helped. A run that has the
-    CPU's cores to itself is no slower. `vmap` of anything else, and runs on other devices, go side by side.
+    Args:
+        state: of one fleet, or of several under `vmap`.
+        num_pairs: how many pairs there shall be more room for; each augmented copy counts.
+
+    Raises:
+        ValueError: if `num_pairs` is not a whole number of at least 0, or the room would exceed 32 bits.
+
+    >>> from fleetjax import make_config
+    >>> state = jax.eval_shape(lambda: prepare(make_config("navigation", "uc", num_steps=10), jax.random.key(0)))
+    >>> state.human_data.pairs.capacity, jax.eval_shape(lambda s: extend(s, 100), state).human_data.pairs.capacity
+    (600, 700)
     """
-    return jax.custom_batching.sequential_vmap(function) if jax.default_backend() == "cpu" else function
+    data = state.human_data
+    if isinstance(num_pairs, bool) or not isinstance(num_pairs, (int, np.integer)) or num_pairs < 0:
+        raise ValueError(f"num_pairs = {num_pairs!r} must be a whole number of at least 0")
+    axis = data.pairs.added.ndim  # behind those of several fleets
+    if data.resample.shape[axis] + num_pairs >= 2**31:
+        raise ValueError(f"num_pairs = {num_pairs} exceeds 32 bits with the {data.resample.shape[axis]} there is room for")
+
+    def grow(rows: jax.Array) -> jax.Array:
+        return jnp.pad(rows, [(0, int(num_pairs) if i == axis else 0) for i in range(rows.ndim)])
+
+    pairs = data.pairs._replace(rows=jax.tree.map(grow, data.pairs.rows))
+    return state._replace(human_data=data._replace(pairs=pairs, resample=grow(data.resample)))
 
 
-def _start(config: Config, env: envs.Env, key: jax.Array, policy: LearnerState, data, critics) -> FleetState:
-    """Return the state at t = 0: robots freshly reset, humans free."""
-    robots = jnp.arange(config.num_robots)
-    return FleetState(
-        timestep=jnp.zeros((), jnp.int32),
-        env=jax.vmap(env.reset)(jax.random.split(key, config.num_robots), robots),
-        humans=HumanState(jnp.full(config.num_humans, -1, jnp.int32), jnp.zeros(config.num_humans, jnp.int32)),
-        resetting=jnp.zeros(config.num_robots, bool),
-        learner=policy,
-        human_data=data,
-        critics=critics,
-        priority=priority.get_algorithm(config.algorithm).make_priority(config).init(),
-    )
-
-
+@in_32_bits
 def run(config: Config, key: jax.Array, state: FleetState | None = None, env: envs.Env | None = None) -> Result:
     """Run a fleet for `config.num_steps` timesteps.
 
     Pure: `jax.jit`, `jax.vmap` over keys and over configs, and so on. Timestep t uses `fold_in(key, t)`, so that a run
-    continued from a state of it, with the same key, is the same run.
+    continued from a state of it, with the same key, is the same run. `vmap` computes runs side by side, which rounds matrix
+    products differently, and a last bit can decide who is helped; `jax.lax.map` gives each run the bits that it has alone.
 
     Args:
         config: configuration.
@@ -92,7 +100,9 @@ def run(config: Config, key: jax.Array, state: FleetState | None = None, env: en
         Result: metrics [T] and the last state.
 
     Raises:
-        ValueError: if the configuration is not valid.
+        ValueError: if the configuration is not valid, the run cannot fit the memory, or the state does not fit the
+            configuration: another environment, algorithm, fleet or network, or no room for the pairs that humans can give
+            (`extend` makes room; where the state's numbers are traced, `Metrics.dropped` counts what was lost).
 
     Reference: paper, Sections 3 and 4.
     """
@@ -100,6 +110,7 @@ def run(config: Config, key: jax.Array, state: FleetState | None = None, env: en
     return Result(metrics, last)
 
 
+@in_32_bits
 def run_logged(
     config: Config, key: jax.Array, state: FleetState | None = None, env: envs.Env | None = None
 ) -> tuple[Result, Interventions]:
@@ -125,23 +136,22 @@ def _run(
     config: Config, key: jax.Array, state: FleetState | None, env: envs.Env | None, choose: Callable[[Fleet], Any]
 ) -> tuple[Any, FleetState]:
     """Scan over the fleet's step that is chosen; return what it gives [T, ...] and the last state."""
-    validate(config, env)
-    env = env or envs.make(config.environment, config.backend)
+    env = check_run(config, env)
+    if state is not None:
+        check_state(config, env, state)
     start = prepare(config, key, env) if state is None else state
 
-    def operate(config: Config, key: jax.Array, start: FleetState) -> tuple[Any, FleetState]:
-        step = choose(make_fleet(config, env))
-
-        def timestep(state: FleetState, _: None) -> tuple[FleetState, Any]:
-            return step(state, jax.random.fold_in(key, state.timestep))
-
-        last, given = jax.lax.scan(timestep, start, length=config.num_steps)
-        return given, last
-
+    step = choose(make_fleet(config, env))
     _, key_steps = jax.random.split(key)
-    return _one_by_one(operate)(config, key_steps, start)
+
+    def timestep(state: FleetState, _: None) -> tuple[FleetState, Any]:
+        return step(state, jax.random.fold_in(key_steps, state.timestep))
+
+    last, given = jax.lax.scan(timestep, start, length=config.num_steps)
+    return given, last
 
 
+@in_32_bits
 def evaluate(config: Config, key: jax.Array, learner: LearnerState, env: envs.Env | None = None) -> Result:
     """Run a trained policy without teleoperation: fresh episodes, hard resets for robots in violation, no updates.
 
@@ -159,11 +169,10 @@ def evaluate(config: Config, key: jax.Array, learner: LearnerState, env: envs.En
 
     Reference: paper, Appendix (evaluating trained simulation policies).
     """
-    validate(config, env)
-    env = env or envs.make(config.environment, config.backend)
-    config = config.replace(algorithm="constraint")
-    key_reset, _ = jax.random.split(key)
     members = jax.tree.leaves(learner.params)[0].shape[0]
+    config = config.replace(algorithm="constraint", ensemble_size=members)
+    env = check_run(config, env)
+    key_reset, _ = jax.random.split(key)
     nothing = create_data(env.spec, ensemble_size=members, capacity=1)
-    state = _start(config, env, key_reset, learner, nothing, {})
+    state = init_state(config, env, key_reset, learner, nothing, {})
     return run(config, key, state, env)

@@ -18,7 +18,7 @@ def env():
 
 
 def table(position=(0.0, 0.0), angle=0.0, goal=(0.5, 0.5)):
-    return block_push.Table(jnp.array(position), jnp.float32(angle), jnp.array(goal))
+    return block_push.Table(jnp.array(position, jnp.float32), jnp.float32(angle), jnp.array(goal, jnp.float32))
 
 
 def begun(*args, **kwargs):

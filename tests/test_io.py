@@ -26,7 +26,7 @@ STEPS = 40
 @functools.cache
 def make_policy():
     learner = make_learner(make_tiny_config(), fleetjax.envs.make("navigation").spec)
-    return jax.jit(learner.init)(jax.random.key(3), Normalizer(jnp.arange(8.0), jnp.arange(1.0, 9.0)))
+    return jax.jit(learner.init)(jax.random.key(3), Normalizer(jnp.arange(8.0), jnp.arange(1.0, 9.0), jnp.float32(10)))
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from fleetjax.learning.networks import Normalizer
 from fleetjax.learning.pretraining import collect_demonstrations
 
 SPEC = EnvSpec("hand", 1, 1, 10, 1.0, has_goal=True, supervisor="toy_scripted")
-IDENTITY = Normalizer(jnp.zeros(1), jnp.ones(1))
+IDENTITY = Normalizer(jnp.zeros(1), jnp.ones(1), jnp.float32(jnp.inf))
 SMALL = fleetjax.Config().replace(
     hidden_sizes=(1,), ensemble_size=2, batch_size=8, num_robots=4, num_humans=2, critic_capacity=20, risk_discount=0.5
 )
@@ -224,7 +224,9 @@ def test_semantic_19_evaluation_resets_at_once_from_the_start_and_learns_nothing
     env = toy_envs.scripted([2, NEVER, NEVER, NEVER], [NEVER, 3, NEVER, NEVER])
     sizes = {"num_robots": 4, "num_humans": 2, "num_steps": 8, "hidden_sizes": (1,), "ensemble_size": 2, "batch_size": 4}
     config = fleetjax.make_config(env, "cur", **sizes, hard_reset_time=3, initial_period=1000, num_demonstrations=4)
-    learner = imitation.make_learner(config, env.spec).init(jax.random.key(0), Normalizer(jnp.zeros(3), jnp.ones(3)))
+    learner = imitation.make_learner(config, env.spec).init(
+        jax.random.key(0), Normalizer(jnp.zeros(3), jnp.ones(3), jnp.float32(10))
+    )
     result = quick_jit(lambda key, learner: fleetjax.evaluate(config, key, learner, env))(jax.random.key(0), learner)
     assert result.metrics.violations.tolist() == [0, 1, 0, 0, 0, 0, 1, 0]
     assert result.metrics.hard_resets.tolist() == [0, 0, 0, 0, 1, 0, 0, 0]

@@ -147,5 +147,5 @@ def make(name: str, backend: str = "auto") -> Env:
         ValueError: if a name is unknown.
     """
     get_defaults(name)
-    with jax.ensure_compile_time_eval():  # constants must outlive the trace that may be running
+    with jax.ensure_compile_time_eval(), jax.enable_x64(False):  # constants must outlive the trace that may be running
         return _ENVS[name].make_env(backend)

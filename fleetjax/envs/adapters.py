@@ -5,7 +5,7 @@ unhealthy end, which is a violation here; the horizon is ours. Pass what these f
 """
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -73,7 +73,8 @@ def from_playground(
 
 def _adapt(raw: Any, name: str, *, supervisor: str, horizon: int, success_return: float | None) -> base.Env:
     """Wrap an object with brax's `reset(key) -> State` and `step(State, action) -> State`."""
-    first = jax.eval_shape(raw.reset, jax.random.PRNGKey(0))
+    raw_reset, raw_step = map(_with_standard_promotion, (raw.reset, raw.step))
+    first = jax.eval_shape(raw_reset, jax.random.PRNGKey(0))
 
     def settle(state: Any) -> Any:
         """Give every leaf the type it has after a reset; a Python float among them would change a scan's carry."""
@@ -81,13 +82,13 @@ def _adapt(raw: Any, name: str, *, supervisor: str, horizon: int, success_return
 
     def reset(key: jax.Array, robot: jax.Array) -> EnvState:
         del robot  # every robot starts from the same distribution
-        inner = settle(raw.reset(jax.random.key_data(key)))
+        inner = settle(raw_reset(jax.random.key_data(key)))
         return base.begin(inner, _observation(inner.obs))
 
     def step(state: EnvState, action: jax.Array, active: jax.Array, key: jax.Array) -> EnvState:
         del active, key  # brax keeps its own key, where it needs one
         before = state.physics
-        after = settle(raw.step(before, action))
+        after = settle(raw_step(before, action))
         finite = jnp.all(jnp.isfinite(_observation(after.obs))) & jnp.isfinite(after.reward)
         inner = jax.tree.map(lambda old, new: jnp.where(finite, new, old), before, after)
         return base.proceed(
@@ -103,6 +104,16 @@ def _adapt(raw: Any, name: str, *, supervisor: str, horizon: int, success_return
     size = jax.eval_shape(_observation, first.obs).shape[-1]
     spec = base.EnvSpec(name, size, raw.action_size, horizon, float(raw.dt), supervisor=supervisor)
     return base.Env(reset, step, spec)
+
+
+def _with_standard_promotion(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that may mix types, as brax does, also where the user asked JAX to be strict."""
+
+    def wrapped(*args: Any) -> Any:
+        with jax.numpy_dtype_promotion("standard"):
+            return function(*args)
+
+    return wrapped
 
 
 def _observation(obs: jax.Array | Mapping[str, jax.Array]) -> jax.Array:

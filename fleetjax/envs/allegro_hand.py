@@ -71,7 +71,7 @@ def make_env(*, backend: str = "auto", tolerance: float = TOLERANCE) -> base.Env
         violation = (distance >= DROP_DISTANCE) | hand.body.diverged
         angle = angle_between(hand.body.qpos[19:23], hand.goal)
         success = angle <= tolerance
-        reward = -10.0 * distance + 1.0 / (angle + 0.1) - 2e-4 * jnp.sum(action**2) + 250.0 * success
+        reward = -10.0 * distance + 1.0 / (angle + 0.1) - 2e-4 * jnp.sum(action**2) + jnp.where(success, 250.0, 0.0)
         return base.proceed(
             state,
             physics=hand,

@@ -119,7 +119,7 @@ def _reward(joints: _Joints, physics: Physics, before: PhysicsState, after: Phys
     return (
         progress / physics.control_step
         + 2.0
-        + 0.1 * (obs[10] > 0.93)
+        + jnp.where(obs[10] > 0.93, 0.1, 0.0)
         + 0.5 * heading
         - 0.01 * jnp.sum(action**2)
         - 0.05 * jnp.sum(jnp.abs(action * obs[33:54]) * joints.effort)

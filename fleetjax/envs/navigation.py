@@ -104,7 +104,7 @@ def teach(state: EnvState) -> jax.Array:
     """Return the teacher's action f32[2]: straight to the goal in its room, else in front of the next door, then through it."""
     position, velocity, goal = state.physics[:2], state.physics[2:4], state.physics[4:]
     room, goal_room = jnp.sum(position[0] > WALLS_X), jnp.sum(goal[0] > WALLS_X)
-    side = jnp.sign(goal_room - room)  # -1 left, 0 here, 1 right
+    side = jnp.sign(goal_room - room).astype(jnp.float32)  # -1 left, 0 here, 1 right
     door = jnp.clip(jnp.where(side > 0, room, room - 1), 0, 1)
     threshold = jnp.stack([jnp.asarray(WALLS_X)[door], jnp.asarray(DOORS_Y)[door]])
     before = threshold - jnp.array([0.12, 0.0]) * side

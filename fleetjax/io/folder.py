@@ -278,7 +278,9 @@ def read_policy(run: Run) -> LearnerState:
     with _blame(run.folder / POLICY):
         spec = envs.make(run.config.environment, run.config.backend).spec
         entries = jnp.zeros(spec.observation_size)
-        shapes = jax.eval_shape(make_learner(run.config, spec).init, jax.random.key(0), Normalizer(entries, entries))
+        shapes = jax.eval_shape(
+            make_learner(run.config, spec).init, jax.random.key(0), Normalizer(entries, entries, entries[0])
+        )
         template = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
         stored = serialization.from_bytes(_policy(template), _read_data(run, POLICY))
         wanted, found = jax.tree.leaves(_policy(template)), jax.tree.leaves(stored)

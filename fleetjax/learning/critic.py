@@ -13,7 +13,7 @@ from fleetjax.config import Config
 from fleetjax.envs import EnvSpec
 from fleetjax.learning import buffer
 from fleetjax.learning.imitation import Learner, LearnerState, stored_obs
-from fleetjax.learning.networks import Normalizer, make_network
+from fleetjax.learning.networks import ADAM, Normalizer, descend, make_network
 from fleetjax.tree import take, where
 
 TWINS = 2
@@ -76,7 +76,6 @@ def make_critic(kind: str, config: Config, spec: EnvSpec, learner: Learner) -> C
     discount = config.risk_discount if safety else config.goal_discount
     pessimistic = jnp.max if safety else jnp.min
     network = make_network(spec, config.hidden_sizes, 1)
-    optimizer = optax.scale_by_adam()
 
     def init(key: jax.Array) -> CriticState:
         inputs = jnp.zeros(spec.observation_size + spec.action_size)
@@ -87,7 +86,7 @@ def make_critic(kind: str, config: Config, spec: EnvSpec, learner: Learner) -> C
         return CriticState(
             params=params,
             target=jax.tree.map(jnp.copy, params),  # its own memory: both may be donated
-            opt_state=optimizer.init(params),
+            opt_state=ADAM.init(params),
             positives=buffer.create(example, few),
             negatives=buffer.create(example, config.critic_capacity),
         )
@@ -114,7 +113,7 @@ def make_critic(kind: str, config: Config, spec: EnvSpec, learner: Learner) -> C
         def draw(key: jax.Array, store: buffer.Buffer) -> Transition:
             return take(store.rows, buffer.draw_index(key, (config.batch_size,), store.size))
 
-        wanted = jnp.arange(config.batch_size) < jnp.round(config.positive_fraction * config.batch_size)
+        wanted = jnp.arange(config.batch_size) < jnp.round(config.positive_fraction * config.batch_size).astype(jnp.int32)
         positive = (wanted & (state.positives.size > 0)) | (state.negatives.size == 0)
         batch = where(positive, draw(key_positive, state.positives), draw(key_negative, state.negatives))
         return batch, jnp.where(positive, state.positives.size, state.negatives.size) > 0
@@ -124,15 +123,14 @@ def make_critic(kind: str, config: Config, spec: EnvSpec, learner: Learner) -> C
         next_action, _ = learner.predict(policy, batch.next_obs)
         next_value = twins(state.target, policy.normalizer, batch.next_obs, next_action)
         reached = batch.violation if safety else batch.success
-        goes_on = ~(batch.violation | reached)
-        target = jnp.where(reached, 1.0, goes_on * discount * pessimistic(next_value, axis=0))
+        ahead = jnp.where(batch.violation, 0.0, discount * pessimistic(next_value, axis=0))
+        target = jnp.where(reached, 1.0, ahead)
 
         def loss(params: Any) -> jax.Array:
             error = twins(params, policy.normalizer, batch.obs, batch.action) - target
-            return jnp.mean(jnp.sum(error**2, axis=0) * valid)
+            return jnp.mean(jnp.where(valid, jnp.sum(error**2, axis=0), 0.0))
 
-        steps, opt_state = optimizer.update(jax.grad(loss)(state.params), state.opt_state)
-        params = jax.tree.map(lambda p, step: p - config.learning_rate * step, state.params, steps)
+        params, opt_state = descend(state.params, jax.grad(loss)(state.params), state.opt_state, config.learning_rate)
         slow = optax.incremental_update(params, state.target, config.target_rate)
         return state._replace(params=params, target=slow, opt_state=opt_state)
 

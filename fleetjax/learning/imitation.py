@@ -15,7 +15,7 @@ from fleetjax.config import Config
 from fleetjax.envs import EnvSpec
 from fleetjax.learning import buffer
 from fleetjax.learning.augmentation import augment
-from fleetjax.learning.networks import Normalizer, make_network
+from fleetjax.learning.networks import ADAM, Normalizer, descend, make_network
 from fleetjax.tree import take
 
 
@@ -32,10 +32,12 @@ class HumanData(NamedTuple):
     Attributes:
         pairs: Buffer of `Pair`.
         resample: i32[capacity, E] for each member, the pairs that it learns from; `pairs.size` of them count.
+        dropped: i32[] pairs so far for which there was no room.
     """
 
     pairs: buffer.Buffer
     resample: jax.Array
+    dropped: jax.Array
 
 
 class LearnerState(NamedTuple):
@@ -49,7 +51,8 @@ class LearnerState(NamedTuple):
 def create_data(spec: EnvSpec, *, ensemble_size: int, capacity: int) -> HumanData:
     """Return an empty data set."""
     example = Pair(stored_obs(spec), jnp.zeros(spec.action_size))
-    return HumanData(buffer.create(example, capacity), jnp.zeros((capacity, ensemble_size), jnp.int32))
+    resample = jnp.zeros((capacity, ensemble_size), jnp.int32)
+    return HumanData(buffer.create(example, capacity), resample, jnp.zeros((), jnp.int32))
 
 
 def stored_obs(spec: EnvSpec) -> jax.Array:
@@ -65,7 +68,8 @@ def append(data: HumanData, pairs: Pair, mask: jax.Array, key: jax.Array) -> Hum
     grown = buffer.append(data.pairs, pairs, mask, overwrite=False)
     draws = buffer.draw_index(key, (data.resample.shape[1], mask.shape[0]), grown.size)
     index = buffer.append(buffer.Buffer(data.resample, data.pairs.added), draws.T, mask, overwrite=False)
-    return HumanData(grown, index.rows)
+    added = grown.added - data.pairs.added
+    return HumanData(grown, index.rows, data.dropped + jnp.sum(mask, dtype=jnp.int32) - added)
 
 
 def append_augmented(
@@ -112,11 +116,10 @@ def make_learner(config: Config, spec: EnvSpec) -> Learner:
     """Build the ensemble for a configuration and an environment."""
     members = 1 if spec.discrete else config.ensemble_size
     network = make_network(spec, config.hidden_sizes, spec.action_size)
-    optimizer = optax.scale_by_adam()
 
     def init(key: jax.Array, normalizer: Normalizer) -> LearnerState:
         params = jax.vmap(lambda k: network.init(k, normalizer.mean))(jax.random.split(key, members))
-        return LearnerState(params, optimizer.init(params), normalizer)
+        return LearnerState(params, ADAM.init(params), normalizer)
 
     def outputs(params: Any, obs: jax.Array) -> jax.Array:
         """f32[E, ..., A] actions, or logits of the classifier; `obs` is normalised."""
@@ -141,8 +144,7 @@ def make_learner(config: Config, spec: EnvSpec) -> Learner:
         index = data.resample[draw, jnp.arange(members)[:, None]]
         batch = take(data.pairs.rows, index)
         losses, grads = jax.vmap(jax.value_and_grad(loss))(state.params, state.normalizer(batch.obs), batch.action)
-        steps, opt_state = optimizer.update(grads, state.opt_state)
-        params = jax.tree.map(lambda p, step: p - config.learning_rate * step, state.params, steps)
+        params, opt_state = descend(state.params, grads, state.opt_state, config.learning_rate)
         return state._replace(params=params, opt_state=opt_state), jnp.mean(losses)
 
     add = append

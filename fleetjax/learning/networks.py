@@ -7,11 +7,16 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import optax
 
 from fleetjax.envs import EnvSpec
 
 STAGES = ((4, 24), (1, 16))  # of the convolutions: side of a patch in pixels, which is also the stride, and channels
 MID_GREY, SPREAD = 127.5, 64.0  # how networks see pixel values, whatever the data
+CLIP = 10.0  # deviations at which normalised observations are clipped
+# Adam without its learning rate, which is a traced field of the configuration. `eps_root` keeps derivatives through an update
+# finite where a gradient is exactly 0, as behind a dead ReLU.
+ADAM = optax.scale_by_adam(eps_root=1e-16)
 
 
 class Network(NamedTuple):
@@ -75,20 +80,34 @@ def make_network(spec: EnvSpec, hidden_sizes: Sequence[int], output_size: int) -
     return make_mlp(hidden_sizes, output_size, first=[_Convolutions(spec.image_shape)])
 
 
+def descend(params: Any, gradients: Any, opt_state: Any, learning_rate: jax.Array | float) -> tuple[Any, Any]:
+    """Return the parameters and the state of `ADAM` after one step against the gradients."""
+    with jax.numpy_dtype_promotion("standard"):  # optax multiplies its i32 count and floats, which "strict" forbids
+        steps, opt_state = ADAM.update(gradients, opt_state)
+    return jax.tree.map(lambda p, step: p - learning_rate * step, params, steps), opt_state
+
+
 class Normalizer(NamedTuple):
-    """Shift and scale of observations: mean f32[O], deviation f32[O]."""
+    """Shift and scale of observations.
+
+    Attributes:
+        mean: f32[O].
+        deviation: f32[O].
+        limit: f32[] deviations from the mean beyond which observations are clipped; infinite for the identity.
+    """
 
     mean: jax.Array
     deviation: jax.Array
+    limit: jax.Array
 
     def __call__(self, obs: jax.Array) -> jax.Array:
-        """Return f32[..., O] observations at about unit scale, clipped to ten deviations."""
-        return jnp.clip((obs.astype(jnp.float32) - self.mean) / self.deviation, -10.0, 10.0)
+        """Return f32[..., O] observations at about unit scale."""
+        return jnp.clip((obs.astype(jnp.float32) - self.mean) / self.deviation, -self.limit, self.limit)
 
 
 def pixel_normalizer(size: int) -> Normalizer:
     """Return what brings pixel values f32[size] to unit scale."""
-    return Normalizer(jnp.full(size, MID_GREY), jnp.full(size, SPREAD))
+    return Normalizer(jnp.full(size, jnp.float32(MID_GREY)), jnp.full(size, jnp.float32(SPREAD)), jnp.float32(CLIP))
 
 
 def fit_normalizer(obs: jax.Array, size: jax.Array, *, enabled: jax.Array | bool) -> Normalizer:
@@ -96,8 +115,9 @@ def fit_normalizer(obs: jax.Array, size: jax.Array, *, enabled: jax.Array | bool
 
     Entries that never vary keep their scale.
     """
-    weight = (jnp.arange(obs.shape[0]) < size)[:, None] / jnp.maximum(size, 1)
+    weight = jnp.where(jnp.arange(obs.shape[0]) < size, 1.0 / jnp.maximum(size, 1).astype(jnp.float32), 0.0)[:, None]
     mean = jnp.sum(weight * obs, axis=0)
     deviation = jnp.sqrt(jnp.sum(weight * (obs - mean) ** 2, axis=0))
     deviation = jnp.where(deviation < 1e-6, 1.0, deviation)
-    return Normalizer(jnp.where(enabled, mean, 0.0), jnp.where(enabled, deviation, 1.0))
+    fitted, identity = (mean, deviation, CLIP), (0.0, 1.0, jnp.inf)
+    return Normalizer(*(jnp.where(enabled, a, b).astype(jnp.float32) for a, b in zip(fitted, identity, strict=True)))

@@ -11,13 +11,14 @@ from fleetjax.learning.networks import fit_normalizer, pixel_normalizer
 from fleetjax.types import EnvState
 
 LANES = 8  # episodes that are demonstrated side by side
+MOST_LANES = 100  # robots that give offline transitions side by side
 BURST = 20  # timesteps of offline transitions between two looks at their number
 
 
 def collect_demonstrations(
     config: Config, env: Env, supervisor: supervisors.Supervisor, add, data: imitation.HumanData, key: jax.Array
 ) -> imitation.HumanData:
-    """Fill `data` with supervisor actions from whole episodes, the last one cut at the number that is asked for.
+    """Fill `data` with supervisor actions from whole episodes of all robots in turn, the last one cut at the number asked for.
 
     Args:
         config: configuration.
@@ -27,7 +28,6 @@ def collect_demonstrations(
         data: what to fill.
         key: random key.
     """
-    lanes = jnp.arange(LANES)
 
     def step(carry: tuple[EnvState, jax.Array], key: jax.Array):
         state, running = carry
@@ -44,7 +44,8 @@ def collect_demonstrations(
     def episodes(carry: tuple[imitation.HumanData, jax.Array]):
         data, count = carry
         key_reset, key_steps, key_data = jax.random.split(jax.random.fold_in(key, count), 3)
-        start = jax.vmap(env.reset)(jax.random.split(key_reset, LANES), lanes)
+        robots = (count * LANES + jnp.arange(LANES)) % config.num_robots
+        start = jax.vmap(env.reset)(jax.random.split(key_reset, LANES), robots)
         keys = jax.random.split(key_steps, env.spec.horizon)
         _, (pairs, valid) = jax.lax.scan(step, (start, jnp.ones(LANES, bool)), keys)
         # Episode after episode, each in order of time.
@@ -53,13 +54,17 @@ def collect_demonstrations(
         return add(data, pairs, valid, key_data), count + 1
 
     wanted = config.num_demonstrations + config.extra_demonstrations
-    limit = jnp.minimum(wanted * config.augmented_copies, config.human_capacity)
+    copies = wanted * config.augmented_copies
+    limit = jnp.minimum(copies, data.pairs.capacity)
     unfinished = lambda carry: carry[0].pairs.added < limit  # noqa: E731
-    return jax.lax.while_loop(unfinished, episodes, (data, jnp.int32(0)))[0]
+    data, _ = jax.lax.while_loop(unfinished, episodes, (data, jnp.int32(0)))
+    return data._replace(dropped=jnp.asarray(copies - data.pairs.added, jnp.int32))
 
 
 def collect_transitions(config: Config, env: Env, act, add, store: critic.CriticState, key: jax.Array) -> critic.CriticState:
-    """Add about `num_critic_transitions` steps of a fleet under noisy actions; robots that end an episode are reset at once.
+    """Add about `num_critic_transitions` steps of a fleet under noisy actions; who ends an episode is reset at once.
+
+    In fleets of more than `MOST_LANES` robots, that many move at a time, and the end of an episode is the next one's turn.
 
     Args:
         config: configuration.
@@ -69,12 +74,12 @@ def collect_transitions(config: Config, env: Env, act, add, store: critic.Critic
         store: the critic.
         key: random key.
     """
-    num_lanes = min(config.num_robots, 100)
+    num_lanes = min(config.num_robots, MOST_LANES)
     lanes = jnp.arange(num_lanes)
     key_start, key_bursts = jax.random.split(key)
 
     def step(carry, key):
-        state, store, count = carry
+        state, store, count, robots = carry
         key_act, key_noise, key_env, key_reset = jax.random.split(key, 4)
         action = disturb(config, env, act(state, key_act), key_noise)
         after = jax.vmap(env.step)(state, action, jnp.ones(num_lanes, bool), jax.random.split(key_env, num_lanes))
@@ -82,8 +87,9 @@ def collect_transitions(config: Config, env: Env, act, add, store: critic.Critic
         wanted = count + lanes < config.num_critic_transitions
         store = add(store, transition, wanted)
         ended = after.violation | after.timeout | after.success
-        fresh = jax.vmap(env.reset)(jax.random.split(key_reset, num_lanes), lanes)
-        return (tree.where(ended, fresh, after), store, count + num_lanes), None
+        robots = jnp.where(ended, (robots + num_lanes) % config.num_robots, robots)
+        fresh = jax.vmap(env.reset)(jax.random.split(key_reset, num_lanes), robots)
+        return (tree.where(ended, fresh, after), store, count + num_lanes, robots), None
 
     def burst(carry):
         keys = jax.random.split(jax.random.fold_in(key_bursts, carry[2]), BURST)
@@ -91,7 +97,7 @@ def collect_transitions(config: Config, env: Env, act, add, store: critic.Critic
 
     start = jax.vmap(env.reset)(jax.random.split(key_start, num_lanes), lanes)
     unfinished = lambda carry: carry[2] < config.num_critic_transitions  # noqa: E731
-    return jax.lax.while_loop(unfinished, burst, (start, store, jnp.int32(0)))[1]
+    return jax.lax.while_loop(unfinished, burst, (start, store, jnp.int32(0), lanes))[1]
 
 
 def disturb(config: Config, env: Env, action: jax.Array, key: jax.Array) -> jax.Array:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from fleetjax.envs.base import Env
 from fleetjax.supervisors import expert
@@ -78,21 +79,35 @@ def list_supervisors() -> tuple[str, ...]:
     return tuple(_SUPERVISORS)
 
 
-def check(name: str) -> None:
-    """Raise a ValueError with the closest names unless `name` is registered."""
-    if not name:
-        raise ValueError("supervisor = '' and the environment names none; register one and pass its name")
-    if name not in _SUPERVISORS:
-        from fleetjax.priority import unknown
+def check(name: str, env: Env) -> None:
+    """Check that a supervisor is registered and can act in an environment; nothing is computed.
 
-        raise ValueError(unknown("supervisor", name, _SUPERVISORS))
+    Raises:
+        ValueError: if it is not, or cannot; the message has the closest names, or the reason.
+    """
+    supervisor = make(name, env)
+    state = jax.eval_shape(env.reset, jax.random.key(0), jax.ShapeDtypeStruct((), jnp.int32))
+    does_not_fit = f"supervisor = {name!r} does not fit environment = {env.spec.name!r}"
+    try:
+        action = jax.eval_shape(supervisor.act, state, jax.random.key(0))
+    except Exception as error:  # whatever another environment's states make of it
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise ValueError(f"{does_not_fit}: it cannot act on its states ({reason}); choose another") from error
+    if getattr(action, "shape", None) != (env.spec.action_size,):
+        found = getattr(action, "shape", type(action).__name__)
+        raise ValueError(f"{does_not_fit}: it gives {found}, and actions have ({env.spec.action_size},); choose another")
 
 
 def make(name: str, env: Env) -> Supervisor:
     """Return the supervisor `name` for an environment.
 
     Raises:
-        ValueError: if the name is unknown.
+        ValueError: if the name is empty or unknown.
     """
-    check(name)
+    if not name:
+        raise ValueError("supervisor = '' and the environment names none; register one and pass its name")
+    if name not in _SUPERVISORS:
+        from fleetjax.priority import unknown
+
+        raise ValueError(unknown("supervisor", name, _SUPERVISORS))
     return _SUPERVISORS[name](env)

@@ -51,7 +51,7 @@ def start(config: Config, env: Env, key: jax.Array) -> FleetState:
         env=jax.vmap(env.reset)(jax.random.split(key_env, n), jnp.arange(n)),
         humans=HumanState(jnp.full(config.num_humans, -1, jnp.int32), jnp.zeros(config.num_humans, jnp.int32)),
         resetting=jnp.zeros(n, bool),
-        learner=learner.init(key_policy, Normalizer(jnp.zeros(size), jnp.ones(size))),
+        learner=learner.init(key_policy, Normalizer(jnp.zeros(size), jnp.ones(size), jnp.float32(10))),
         human_data=imitation.create_data(env.spec, ensemble_size=members, capacity=config.human_capacity),
         critics={kind: parts.init(key) for (kind, parts), key in zip(critics.items(), keys_critics, strict=False)},
         priority=algorithm.make_priority(config).init(),

@@ -1,0 +1,164 @@
+"""What is refused before anything is computed: runs beyond the memory, and states that do not fit their configuration."""
+
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+
+from fleetjax import envs
+from fleetjax.config import Config, taught_pairs, validate
+from fleetjax.envs import Env
+from fleetjax.fleet import FleetState, init_state
+from fleetjax.learning import critic, imitation
+from fleetjax.learning.buffer import Buffer
+from fleetjax.learning.networks import Normalizer
+from fleetjax.metrics import Metrics
+from fleetjax.precision import in_32_bits
+from fleetjax.priority import get_algorithm
+
+_GIB = 2**30
+# Where Linux keeps the limit of a container's memory: control groups, version 2 and 1.
+_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+
+
+@in_32_bits
+def state_shapes(config: Config, env: Env) -> FleetState:
+    """Return shapes and types of a fleet's state; nothing is computed."""
+
+    def blank(config: Config, key: jax.Array) -> FleetState:
+        learner = imitation.make_learner(config, env.spec)
+        zeros = jnp.zeros(env.spec.observation_size)
+        data = imitation.create_data(env.spec, ensemble_size=config.ensemble_size, capacity=config.human_capacity)
+        critics = {
+            kind: critic.make_critic(kind, config, env.spec, learner).init(key)
+            for kind in get_algorithm(config.algorithm).critics
+        }
+        return init_state(config, env, key, learner.init(key, Normalizer(zeros, zeros, zeros[0])), data, critics)
+
+    return jax.eval_shape(blank, config, jax.random.key(0))
+
+
+def check_run(config: Config, env: Env | None = None) -> Env:
+    """Check all that can be checked before a run is computed; return its environment.
+
+    Args:
+        config: configuration.
+        env: the environment, if it is not the registered one that the configuration names.
+
+    Raises:
+        ValueError: if the configuration is not valid, or the run cannot fit the memory.
+    """
+    validate(config, env)
+    env = env or envs.make(config.environment, config.backend)
+    check_memory(config, env)
+    return env
+
+
+def check_memory(config: Config, env: Env) -> None:
+    """Check that the arrays that a run cannot do without fit the memory.
+
+    Raises:
+        ValueError: if they do not; the message has the estimate, the memory there is, and the fields to reduce.
+    """
+    state = state_shapes(config, env)
+    critics = [store.params for store in state.critics.values()]
+    parts = {
+        "num_robots": _bytes(state.env),
+        "hidden_sizes": 4 * _bytes((state.learner.params, critics)),  # with Adam's two moments, and the gradients
+        "human_capacity": _bytes(state.human_data),
+        "critic_capacity": sum(_bytes((store.positives, store.negatives)) for store in state.critics.values()),
+        "num_steps": config.num_steps * 4 * len(Metrics._fields),
+    }
+    needed, limit = sum(parts.values()), _memory()
+    if needed > limit:
+        largest = max(parts, key=lambda name: parts[name])
+        raise ValueError(
+            f"{largest} = {getattr(config, largest)} is too large: the run needs at least {needed / _GIB:,.1f} GiB of memory "
+            f"({parts[largest] / _GIB:,.1f} of them for this), and there are {limit / _GIB:,.1f}"
+        )
+
+
+def _bytes(tree: Any) -> int:
+    return sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
+
+
+def _memory() -> int:
+    """Return the bytes of memory of the default device; on a CPU, what this process may have of the machine's."""
+    stats = jax.local_devices()[0].memory_stats()
+    if stats and "bytes_limit" in stats:
+        return stats["bytes_limit"]
+    limits = [Path(name).read_text().strip() for name in _LIMITS if Path(name).is_file()]
+    machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return min([machine, *(int(limit) for limit in limits if limit.isdecimal())])
+
+
+def check_state(config: Config, env: Env, state: FleetState) -> None:
+    """Check that a run can start from a state.
+
+    Raises:
+        ValueError: if the state is another environment's, algorithm's or fleet's, or (where its numbers are concrete) has no
+            room for the pairs that the run can give.
+    """
+    made = state.origin
+    if made.environment not in ("", env.spec.name):
+        raise ValueError(
+            f"environment = {env.spec.name!r}, and the state was prepared for {made.environment!r}; prepare one for it"
+        )
+    if state.resetting.ndim != 1:
+        raise ValueError("the state holds several fleets; use jax.vmap or jax.lax.map over them")
+    sizes = {"num_robots": state.resetting.shape[0], "num_humans": state.humans.robot.shape[0]}
+    for name, found in sizes.items():
+        if found != getattr(config, name):
+            raise ValueError(f"{name} = {getattr(config, name)}, and the state was prepared for {found}; prepare one for it")
+    wanted, given = _layout(state_shapes(config, env)), _layout(state)
+    if jax.tree.structure(wanted) != jax.tree.structure(given):
+        raise ValueError(
+            f"algorithm = {config.algorithm!r} keeps other critics or another memory than {made.algorithm!r}, for which the "
+            "state was prepared; prepare one for it"
+        )
+    for (path, found), leaf in zip(jax.tree_util.tree_leaves_with_path(given), jax.tree.leaves(wanted), strict=True):
+        if (found.shape, found.dtype) != (leaf.shape, leaf.dtype):
+            raise ValueError(
+                f"the state does not fit the configuration: its {jax.tree_util.keystr(path)} is {_shown(found)}, and "
+                f"{_shown(leaf)} is wanted; prepare one for it"
+            )
+    _check_room(config, state)
+
+
+def _layout(state: FleetState) -> FleetState:
+    """Return shapes and types; of buffers those of a row, since any capacity will do."""
+
+    def describe(x: Any) -> Any:
+        if isinstance(x, Buffer):
+            return Buffer(jax.tree.map(lambda rows: _struct(rows, 1), x.rows), _struct(x.added))
+        return _struct(x)
+
+    data = state.human_data
+    described = jax.tree.map(describe, state, is_leaf=lambda x: isinstance(x, Buffer))
+    resample = _struct(data.resample, 1)
+    return described._replace(
+        human_data=described.human_data._replace(resample=resample), origin=FleetState._field_defaults["origin"]
+    )
+
+
+def _struct(x: Any, first_axis: int = 0) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(x.shape[first_axis:], x.dtype)
+
+
+def _shown(x: jax.ShapeDtypeStruct) -> str:
+    return f"{x.dtype}{list(x.shape)}"
+
+
+def _check_room(config: Config, state: FleetState) -> None:
+    pairs = state.human_data.pairs
+    stored = 0 if isinstance(pairs.added, Tracer) else int(pairs.added)
+    missing = stored + taught_pairs(config) - pairs.capacity
+    if missing > 0:
+        raise ValueError(
+            f"num_steps = {config.num_steps} can give {taught_pairs(config)} human pairs, and the state has room for "
+            f"{pairs.capacity - stored} more; make room with fleetjax.extend(state, {missing})"
+        )

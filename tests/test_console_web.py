@@ -111,6 +111,51 @@ def test_other_host_names_are_refused(served, host):
     assert refusal.value.response.status_code in (400, 403)
 
 
+MALFORMED_HOSTS = (
+    *("127.0.0.1:abc", "127.0.0.1:99999", "127.0.0.1:-1", "127.0.0.1:1:2", "127.0.0.1:8 0", "127.0.0.1:\xb2", "localhost:0x50"),
+    *("[::1", "[::1]:abc", "[]", "[", "]", "::1", ":80", ":", "127.0.0.1/", "127.0.0.1?a", "127.0.0.1#a", "me@127.0.0.1"),
+    *("127.0.0.1\\", "127.0.0.1\t80", "\xff", "\xc2\xbd", "%00", "127.0.0.1, 127.0.0.1", "x" * 5000, "127.0.0.1:" + "9" * 5000),
+)
+MALFORMED_ORIGINS = (
+    "http://",
+    "://",
+    "http://[",
+    "http://[::1",
+    "http://127.0.0.1:abc",
+    "\xff",
+    "x" * 5000,
+    "http://127.0.0.1:99999",
+)
+MALFORMED_COOKIES = (
+    "=",
+    ";",
+    "a=\xff",
+    'fleetjax-="\\777',
+    "\x7f",
+    "[]=1",
+    "$Version=1; =",
+    'a="' + "\\" * 2000,
+    "a=b; " * 1000,
+)
+
+
+@pytest.mark.parametrize("token", [None, TOKEN])
+def test_malformed_headers_are_refused(session, token):
+    with serving(session, token=token) as served:
+        for host in MALFORMED_HOSTS:
+            for path in ("/", "/ws/operator", f"/?token={TOKEN}"):
+                assert served.get(path, Host=host).status in (400, 421), host
+            with pytest.raises(InvalidStatus) as refusal:
+                served.page(additional_headers={"Host": host, "Origin": f"http://{host}"})
+            assert refusal.value.response.status_code in (400, 403), host
+        for origin in MALFORMED_ORIGINS:
+            with pytest.raises(InvalidStatus) as refusal:
+                served.page(additional_headers={"Origin": origin})
+            assert refusal.value.response.status_code in (400, 403), origin
+        for cookie in MALFORMED_COOKIES:
+            assert served.get("/", Cookie=cookie).status in (400, 403 if token else 200), cookie
+
+
 @pytest.mark.parametrize("name", ["localhost", "127.0.0.1", "LOCALHOST", "[::1]", "127.0.0.1:9999"])
 def test_names_of_this_machine_are_let_in(served, name):
     assert served.get("/", Host=name).status == 200

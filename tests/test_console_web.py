@@ -1,6 +1,8 @@
 """Consoles as clients meet them: pages and WebSockets, what is refused, what goes wrong; and real browsers."""
 
+import asyncio
 import contextlib
+import json
 import shutil
 import socket
 
@@ -346,6 +348,29 @@ def test_coming_back_with_the_key_gives_the_same_seat_and_robot(session):
                 hear(page, "replaced")
                 assert closing_code(page) == 1000
         assert robot >= 0
+
+
+def test_a_page_with_a_seat_gets_no_other_by_its_key(served):
+    with served.page() as page, served.page() as other:
+        key, mine = claim(page)["key"], claim(other)
+        answer = claim(other, key=key)
+        assert (answer["type"], answer["reason"], answer["free"]) == ("taken", "you have a seat already", [])
+        assert claim(other, key=mine["key"], seat=0) == mine
+        assert claim(page, key=key, seat=1)["seat"] == 0
+
+
+def test_a_page_that_is_replaced_gets_no_other_seat_before_it_is_closed(session):
+    async def seats_in_the_end() -> list[int | None]:
+        console = server.Console(session, server.Options("127.0.0.1", 0, None, 0.02, 60.0, 0, simulated=False))
+        page, other = server.Client("operator"), server.Client("operator")
+        ask = {"type": "claim", "key": "", "seat": -1}
+        console._hear(page, json.dumps(ask))
+        key = json.loads(page.notices[-1])["key"]
+        console._hear(other, json.dumps(ask | {"key": key}))
+        console._hear(page, json.dumps(ask))
+        return [None if seat.client is None else (page, other).index(seat.client) for seat in console.seats.seats]
+
+    assert asyncio.run(seats_in_the_end()) == [1, None]
 
 
 def test_leaving_frees_the_seat_at_once(served):

@@ -81,9 +81,9 @@ def _shown(values: list[float], digits: int) -> str:
 
 
 def show(data: list[tuple[Config, int, Metrics]], picture: Path) -> None:
-    """Print the table, and draw the figure of all but the expert, whose curves would flatten the others."""
+    """Print the table, and draw the figure; the expert, whose curves would flatten the others, is in it if it is alone."""
     print(table(data))
-    shown = [entry for entry in data if entry[0].algorithm != "expert"]
+    shown = [entry for entry in data if entry[0].algorithm != "expert"] or data
     files.write(picture, figure.render(figure.draw(figure.group(shown))))
     print(f"\n{picture}")
 

@@ -93,9 +93,12 @@ CASES = {
         quick=True,
     ),
     "experiments/first_look.py": Case(
-        (f"--environments navigation --algorithms random --seeds 0 1 --output looks -- {FLEET}",),
-        (row("navigation", "Random", r"\d+ ± \d+"), r"^looks/first_look\.png$"),
-        ("looks/first_look.png", "looks/navigation-random-1/policy.msgpack"),
+        (
+            f"--environments navigation --algorithms random --seeds 0 1 --output looks -- {FLEET}",
+            "--environments navigation --algorithms expert --output alone -- --num-robots 4 --num-steps 4",
+        ),
+        (row("navigation", "Random", r"\d+ ± \d+"), row("navigation", "Expert", r"\d+"), r"^looks/first_look\.png$"),
+        ("looks/first_look.png", "alone/first_look.png", "looks/navigation-random-1/policy.msgpack"),
     ),
     "experiments/human_time.py": Case(
         ("run-0 run-1",),

@@ -3,6 +3,7 @@
 import argparse
 import itertools
 import statistics
+import sys
 import time
 from collections.abc import Callable, Collection
 from typing import Any
@@ -14,7 +15,9 @@ import numpy as np
 from mujoco import rollout
 
 import fleetjax
+from fleetjax.config import FIELDS
 from fleetjax.envs import allegro_hand, anymal, humanoid
+from fleetjax.io import flags
 from fleetjax.physics.base import MODELS, PhysicsState
 from fleetjax.physics.native import num_threads
 
@@ -43,6 +46,17 @@ def add_names(parser: argparse.ArgumentParser, dest: str, known: Collection[str]
     parser.add_argument(
         dest, nargs="*", type=check, default=list(known), help=f"out of {', '.join(known)}; all if none is given"
     )
+
+
+def parse(parser: argparse.ArgumentParser) -> tuple[argparse.Namespace, dict[str, Any]]:
+    """Parse the command line; return the script's own arguments, and the fields of `Config` that follow `--`."""
+    words = sys.argv[1:]
+    cut = words.index("--") if "--" in words else len(words)
+    try:
+        found = vars(flags.parse(["run", *words[cut + 1 :]]))
+    except flags.Refusal as refusal:
+        parser.error(str(refusal))
+    return parser.parse_args(words[:cut]), {name: value for name, value in found.items() if name in FIELDS}
 
 
 def seconds(function: Callable[..., Any], *args: Any) -> tuple[float, Any]:

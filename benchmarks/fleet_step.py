@@ -1,6 +1,8 @@
 """Time a C.U.R. timestep of each robot at the paper's scale beside what it cannot do without, in one process.
 
-    python benchmarks/fleet_step.py [ENVIRONMENT ...] [--steps 200] [--repeats 7]
+    python benchmarks/fleet_step.py [ENVIRONMENT ...] [--steps 200] [--repeats 7] [-- PARAMETERS]
+
+What follows `--` are parameters as `fleetjax run` takes them, in place of the paper's: `-- --num-robots 1000`.
 
 The bound is raw `mujoco.rollout` for the robots that move, from the same states with the same substeps and threads, plus
 the gradient steps' operations at the rate of a large matrix product. The environment's step, compiled by itself, tells
@@ -9,19 +11,31 @@ physics' share of the time. All are measured in turn, the medians count.
 
 import argparse
 import statistics
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import REGISTERED, RawRollout, add_names, body_of, gradient_step_operations, matrix_rate, seconds, stretch, table
+from common import (
+    REGISTERED,
+    RawRollout,
+    add_names,
+    body_of,
+    gradient_step_operations,
+    matrix_rate,
+    parse,
+    seconds,
+    stretch,
+    table,
+)
 
 import fleetjax
 
 
-def measure(environment: str, *, num_steps: int, repeats: int) -> dict[str, str]:
+def measure(environment: str, parameters: dict[str, Any], *, num_steps: int, repeats: int) -> dict[str, str]:
     """Return a row of the table."""
     # No initial period: in it robots in violation lie still, and few would move.
-    config = fleetjax.make_config(environment, "cur", initial_period=0, backend="native")
+    config = fleetjax.make_config(environment, "cur", **{"initial_period": 0} | parameters, backend="native")
     env = fleetjax.envs.make(environment, "native")
     key = jax.random.key(0)
     run = stretch(config, num_steps)
@@ -66,8 +80,8 @@ def main() -> None:
     add_names(parser, "environments", REGISTERED)
     parser.add_argument("--steps", type=int, default=200, help="timesteps in a timed stretch")
     parser.add_argument("--repeats", type=int, default=7, help="timed stretches")
-    args = parser.parse_args()
-    print(table([measure(name, num_steps=args.steps, repeats=args.repeats) for name in args.environments]))
+    args, parameters = parse(parser)
+    print(table([measure(name, parameters, num_steps=args.steps, repeats=args.repeats) for name in args.environments]))
 
 
 if __name__ == "__main__":

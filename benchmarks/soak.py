@@ -87,6 +87,7 @@ def main() -> None:
                 elif "from the start" in said:
                     lost += before
                 if process.returncode == 0:
+                    assert going_on or "from the start" in said or arguments[0] != "--resume", said
                     break
                 assert process.returncode == -9, said
                 if (killed / "config.json").exists():

@@ -3,7 +3,7 @@
 import argparse
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -35,8 +35,13 @@ def finished(path: Path) -> bool:
         return False
 
 
-def run_missing(cases: Iterable[Case], output: Path) -> list[tuple[Config, int, Metrics]]:
+def run_missing(cases: Iterable[Case], output: Path, parameters: Sequence[str]) -> list[tuple[Config, int, Metrics]]:
     """Run the cases that are not finished yet, one after the other; return the configuration, seed and metrics of all.
+
+    Args:
+        cases: what to run.
+        output: folder of the run folders.
+        parameters: further flags of `fleetjax run`.
 
     Raises:
         subprocess.CalledProcessError: if a run fails.
@@ -45,7 +50,7 @@ def run_missing(cases: Iterable[Case], output: Path) -> list[tuple[Config, int, 
     for (environment, algorithm, seed), path in paths.items():
         if not finished(path):
             command = [sys.executable, "-m", "fleetjax", "run", environment, "--algorithm", algorithm]
-            subprocess.run([*command, "--seed", str(seed), "--output", path, "--overwrite"], check=True)
+            subprocess.run([*command, "--seed", str(seed), "--output", path, "--overwrite", *parameters], check=True)
     runs = [folder.read_run(path) for path in paths.values()]
     return [(run.config, run.seed, folder.read_metrics(run)) for run in runs]
 
@@ -76,9 +81,9 @@ def _shown(values: list[float], digits: int) -> str:
 
 
 def show(data: list[tuple[Config, int, Metrics]], picture: Path) -> None:
-    """Print the table, and draw the figure of all but the expert, whose curves would flatten the others."""
+    """Print the table, and draw the figure; the expert, whose curves would flatten the others, is in it if it is alone."""
     print(table(data))
-    shown = [entry for entry in data if entry[0].algorithm != "expert"]
+    shown = [entry for entry in data if entry[0].algorithm != "expert"] or data
     files.write(picture, figure.render(figure.draw(figure.group(shown))))
     print(f"\n{picture}")
 
@@ -88,5 +93,6 @@ def make_parser(about: str | None, *, output: Path, seeds: list[int]) -> argpars
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--algorithms", nargs="+", choices=fleetjax.list_algorithms(), default=list(ALGORITHMS))
     parser.add_argument("--seeds", type=int, nargs="+", default=seeds)
-    parser.add_argument("--output", type=Path, default=output)
+    parser.add_argument("--output", type=Path, default=output, help="folder of the runs; other parameters need another one")
+    parser.add_argument("parameters", nargs="*", help="after --: parameters of every run, as `fleetjax run` takes them")
     return parser

@@ -1,6 +1,6 @@
 """Run every algorithm on every robot that it fits, at the paper's scale with one seed; print the table, draw the figure.
 
-    python experiments/first_look.py [--environments humanoid anymal ...] [--output runs/first_look]
+    python experiments/first_look.py [--environments humanoid anymal ...] [--output runs/first_look] [-- PARAMETERS]
 
 A run takes minutes on two cores. Finished runs are not run again: stop it at any time, and start it anew.
 """
@@ -18,7 +18,7 @@ def main() -> None:
     parser.add_argument("--environments", nargs="+", choices=fleetjax.list_envs(), default=fleetjax.list_envs())
     args = parser.parse_args()
     cases = [(e, a, s) for e in args.environments for a in args.algorithms if fits(e, a) for s in args.seeds]
-    show(run_missing(cases, args.output), args.output / "first_look.png")
+    show(run_missing(cases, args.output, args.parameters), args.output / "first_look.png")
 
 
 if __name__ == "__main__":

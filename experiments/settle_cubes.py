@@ -1,12 +1,14 @@
 """Drop cubes into Allegro hands and keep what comes to rest: the states that episodes start from.
 
-    python experiments/settle_cubes.py
+    python experiments/settle_cubes.py [--number 1024] [--seed 0] [--output FILE]
 
 Fingers hold a random, slightly bent pose; cubes fall from 4 cm above the goal in random orientations. A cube that lies
-still near the goal after two seconds is kept. Writes `fleetjax/physics/models/allegro_hand_settled.npz`.
+still near the goal after two seconds is kept. Without --output it writes the file that the package ships,
+`fleetjax/physics/models/allegro_hand_settled.npz`.
 """
 
 import argparse
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -36,6 +38,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--number", type=int, default=1024, help="states to keep")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--output", type=Path, default=allegro_hand.SETTLED, help="npz file to write")
     args = parser.parse_args()
     model = mujoco.MjModel.from_xml_path(str(MODELS / "allegro_hand.xml"))
     steps = round(SECONDS / model.opt.timestep)
@@ -52,7 +55,7 @@ def main() -> None:
             kept.append(qpos[near & (np.abs(qvel).max(axis=1) < SLOW)])
             tried += args.number
     print(f"{sum(map(len, kept))} of {tried} cubes came to rest near the goal")
-    np.savez_compressed(allegro_hand.SETTLED, qpos=np.concatenate(kept)[: args.number].astype(np.float32))
+    np.savez_compressed(args.output, qpos=np.concatenate(kept)[: args.number].astype(np.float32))
 
 
 if __name__ == "__main__":

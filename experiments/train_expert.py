@@ -5,7 +5,7 @@
 
 Every evaluation appends a row to `curve.csv` and writes a checkpoint (observation statistics, policy and value
 network; the optimizer starts afresh after an interruption). `--ship` scores the checkpoints with the
-highest returns on many fresh episodes and writes the best one to `fleetjax/supervisors/weights/`.
+highest returns on many fresh episodes and writes the best one to `fleetjax/supervisors/weights/`, or to --weights.
 """
 
 import argparse
@@ -13,7 +13,7 @@ import csv
 import dataclasses
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -137,17 +137,16 @@ def checkpoints(folder: Path) -> list[Path]:
 
 
 def train_expert(
-    name: str, folder: Path, *, num_timesteps: int, evaluate_every: int, seed: int, learning_rate: float | None
+    name: str, folder: Path, *, num_timesteps: int, evaluate_every: int, seed: int, settings: Mapping[str, float]
 ) -> None:
-    """Train until `num_timesteps` in all, from the last checkpoint if there is one."""
+    """Train until `num_timesteps` in all, from the last checkpoint if there is one; `settings` go before a stage's own."""
     folder.mkdir(parents=True, exist_ok=True)
     stages = TRAININGS[name].stages
     ends = [*(stage.begins for stage in stages[1:]), num_timesteps]
     for stage, end in zip(stages, ends, strict=True):
-        settings = stage.settings | ({} if learning_rate is None else {"learning_rate": learning_rate})
         if steps_done(folder) < min(end, num_timesteps):
             train_stage(
-                Task(TRAININGS[name], stage._replace(settings=settings)),
+                Task(TRAININGS[name], stage._replace(settings={**stage.settings, **settings})),
                 folder,
                 num_timesteps=min(end, num_timesteps),
                 evaluate_every=evaluate_every,
@@ -210,20 +209,19 @@ def train_stage(task: Task, folder: Path, *, num_timesteps: int, evaluate_every:
         print(row, {k: float(v) for k, v in metrics.items() if any(word in k for word in shown)}, flush=True)
 
     remaining = num_timesteps - done
+    usual: dict[str, Any] = {**SHARED, "episode_length": task.stage.episode_length or task.training.episode_length}
     train.train(
         environment=task,
         num_timesteps=remaining,
-        episode_length=task.stage.episode_length or task.training.episode_length,
         normalize_observations=True,
         network_factory=network_factory(task.training, task.stage.mirror),
         num_evals=max(2, 1 + remaining // evaluate_every),
         deterministic_eval=True,
-        num_eval_envs=128,
         seed=seed + done,
         progress_fn=log,
         policy_params_fn=save,
         restore_params=restore,
-        **SHARED | task.stage.settings,
+        **usual | task.stage.settings,
     )
 
 
@@ -259,8 +257,8 @@ def as_weights(params, training: Training) -> dict[str, np.ndarray]:
     return {name: np.asarray(value, np.float32) for name, value in weights.items()}
 
 
-def ship(name: str, folder: Path, *, candidates: int, num_episodes: int) -> None:
-    """Score the most promising checkpoints on fresh episodes and write the best into the package.
+def ship(name: str, folder: Path, output: Path, *, candidates: int, num_episodes: int) -> None:
+    """Score the most promising checkpoints on fresh episodes and write the best into the folder `output`.
 
     Episodes whose return is at least 95 % of the mean over full-length episodes (and the task's floor) succeed;
     the checkpoint with most successes wins. Where there are goals, the one that reaches most of them wins.
@@ -295,11 +293,17 @@ def ship(name: str, folder: Path, *, candidates: int, num_episodes: int) -> None
         if best is None or record[criterion] > best[0][criterion]:
             best = (record, weights)
     assert best is not None, f"no checkpoint of the last stage in {folder}"
-    PACKAGE_WEIGHTS.mkdir(exist_ok=True)
-    np.savez_compressed(PACKAGE_WEIGHTS / f"{name}.npz", **best[1])  # pyright: ignore[reportArgumentType]
-    (PACKAGE_WEIGHTS / f"{name}.json").write_text(json.dumps(best[0], indent=2) + "\n")
-    (PACKAGE_WEIGHTS / f"{name}_curve.csv").write_text((folder / "curve.csv").read_text())
+    output.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(output / f"{name}.npz", **best[1])  # pyright: ignore[reportArgumentType]
+    (output / f"{name}.json").write_text(json.dumps(best[0], indent=2) + "\n")
+    (output / f"{name}_curve.csv").write_text((folder / "curve.csv").read_text())
     print(f"shipped {best[0]}")
+
+
+def setting(text: str) -> tuple[str, float]:
+    """Return the name and the number in `NAME=NUMBER`."""
+    name, number = text.split("=")
+    return name, json.loads(number)
 
 
 def main() -> None:
@@ -311,13 +315,22 @@ def main() -> None:
     parser.add_argument("--evaluate-every", type=int, default=1_000_000, help="environment steps between evaluations")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--learning-rate", type=float, help="in place of the task's setting, to anneal a resumed run")
-    parser.add_argument("--ship", action="store_true", help="choose the best checkpoint and write it into the package")
+    parser.add_argument(
+        "--settings",
+        nargs="+",
+        type=setting,
+        metavar="NAME=NUMBER",
+        default=[],
+        help="of brax's PPO, in place of the task's: num_envs=256",
+    )
+    parser.add_argument("--ship", action="store_true", help="choose the best checkpoint and write it into --weights")
+    parser.add_argument("--weights", type=Path, default=PACKAGE_WEIGHTS, help="folder of --ship [default: the package's]")
     parser.add_argument("--candidates", type=int, default=5, help="checkpoints to score with --ship")
     parser.add_argument("--num-episodes", type=int, default=512, help="episodes a checkpoint is scored on with --ship")
     args = parser.parse_args()
     folder = args.output or Path("runs/experts") / args.environment
     if args.ship:
-        ship(args.environment, folder, candidates=args.candidates, num_episodes=args.num_episodes)
+        ship(args.environment, folder, args.weights, candidates=args.candidates, num_episodes=args.num_episodes)
     else:
         train_expert(
             args.environment,
@@ -325,7 +338,7 @@ def main() -> None:
             num_timesteps=args.num_timesteps,
             evaluate_every=args.evaluate_every,
             seed=args.seed,
-            learning_rate=args.learning_rate,
+            settings=dict(args.settings) | ({} if args.learning_rate is None else {"learning_rate": args.learning_rate}),
         )
 
 

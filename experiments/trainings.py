@@ -173,6 +173,7 @@ def turning(before: EnvState, after: EnvState) -> jax.Array:
 
 SHARED = {
     "num_envs": 1024,
+    "num_eval_envs": 128,
     "unroll_length": 16,
     "batch_size": 64,
     "num_minibatches": 32,

@@ -181,6 +181,25 @@ def test_a_key_gives_the_same_seat_again_and_no_other_key_does(table):
     assert table.of("again") is None
 
 
+def test_the_key_of_another_seat_gives_nobody_a_second_one(table):
+    _, first, _ = table.claim("a", 0.0)
+    second, key, _ = table.claim("b", 0.0)
+    for gone in (False, True):
+        with pytest.raises(seats.Refused, match="you have a seat already"):
+            table.claim("b", 1.0, key=first)
+        if not gone:
+            table.drop("a", 1.0)
+    assert table.claim("b", 2.0, key=key) == (second, key, None)
+    assert [seat.client for seat in table.seats] == [None, "b"]
+    table.claim("reloaded", 3.0, key=first)
+    with pytest.raises(seats.Refused, match="every seat is taken"):
+        table.claim("a", 3.0)
+    table.leave("b")
+    with pytest.raises(seats.Refused, match="you have a seat already"):
+        table.claim("reloaded", 4.0, key=key)
+    assert [seat.client for seat in table.seats] == ["reloaded", None]
+
+
 def test_a_lost_seat_is_kept_until_the_timeout(table):
     table.claim("a", 0.0)
     table.drop("a", 5.0)

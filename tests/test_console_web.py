@@ -1,6 +1,8 @@
 """Consoles as clients meet them: pages and WebSockets, what is refused, what goes wrong; and real browsers."""
 
+import asyncio
 import contextlib
+import json
 import shutil
 import socket
 
@@ -109,6 +111,51 @@ def test_other_host_names_are_refused(served, host):
     with pytest.raises(InvalidStatus) as refusal:
         served.page(additional_headers={"Host": host, "Origin": f"http://{host}"})
     assert refusal.value.response.status_code in (400, 403)
+
+
+MALFORMED_HOSTS = (
+    *("127.0.0.1:abc", "127.0.0.1:99999", "127.0.0.1:-1", "127.0.0.1:1:2", "127.0.0.1:8 0", "127.0.0.1:\xb2", "localhost:0x50"),
+    *("[::1", "[::1]:abc", "[]", "[", "]", "::1", ":80", ":", "127.0.0.1/", "127.0.0.1?a", "127.0.0.1#a", "me@127.0.0.1"),
+    *("127.0.0.1\\", "127.0.0.1\t80", "\xff", "\xc2\xbd", "%00", "127.0.0.1, 127.0.0.1", "x" * 5000, "127.0.0.1:" + "9" * 5000),
+)
+MALFORMED_ORIGINS = (
+    "http://",
+    "://",
+    "http://[",
+    "http://[::1",
+    "http://127.0.0.1:abc",
+    "\xff",
+    "x" * 5000,
+    "http://127.0.0.1:99999",
+)
+MALFORMED_COOKIES = (
+    "=",
+    ";",
+    "a=\xff",
+    'fleetjax-="\\777',
+    "\x7f",
+    "[]=1",
+    "$Version=1; =",
+    'a="' + "\\" * 2000,
+    "a=b; " * 1000,
+)
+
+
+@pytest.mark.parametrize("token", [None, TOKEN])
+def test_malformed_headers_are_refused(session, token):
+    with serving(session, token=token) as served:
+        for host in MALFORMED_HOSTS:
+            for path in ("/", "/ws/operator", f"/?token={TOKEN}"):
+                assert served.get(path, Host=host).status in (400, 421), host
+            with pytest.raises(InvalidStatus) as refusal:
+                served.page(additional_headers={"Host": host, "Origin": f"http://{host}"})
+            assert refusal.value.response.status_code in (400, 403), host
+        for origin in MALFORMED_ORIGINS:
+            with pytest.raises(InvalidStatus) as refusal:
+                served.page(additional_headers={"Origin": origin})
+            assert refusal.value.response.status_code in (400, 403), origin
+        for cookie in MALFORMED_COOKIES:
+            assert served.get("/", Cookie=cookie).status in (400, 403 if token else 200), cookie
 
 
 @pytest.mark.parametrize("name", ["localhost", "127.0.0.1", "LOCALHOST", "[::1]", "127.0.0.1:9999"])
@@ -301,6 +348,29 @@ def test_coming_back_with_the_key_gives_the_same_seat_and_robot(session):
                 hear(page, "replaced")
                 assert closing_code(page) == 1000
         assert robot >= 0
+
+
+def test_a_page_with_a_seat_gets_no_other_by_its_key(served):
+    with served.page() as page, served.page() as other:
+        key, mine = claim(page)["key"], claim(other)
+        answer = claim(other, key=key)
+        assert (answer["type"], answer["reason"], answer["free"]) == ("taken", "you have a seat already", [])
+        assert claim(other, key=mine["key"], seat=0) == mine
+        assert claim(page, key=key, seat=1)["seat"] == 0
+
+
+def test_a_page_that_is_replaced_gets_no_other_seat_before_it_is_closed(session):
+    async def seats_in_the_end() -> list[int | None]:
+        console = server.Console(session, server.Options("127.0.0.1", 0, None, 0.02, 60.0, 0, simulated=False))
+        page, other = server.Client("operator"), server.Client("operator")
+        ask = {"type": "claim", "key": "", "seat": -1}
+        console._hear(page, json.dumps(ask))
+        key = json.loads(page.notices[-1])["key"]
+        console._hear(other, json.dumps(ask | {"key": key}))
+        console._hear(page, json.dumps(ask))
+        return [None if seat.client is None else (page, other).index(seat.client) for seat in console.seats.seats]
+
+    assert asyncio.run(seats_in_the_end()) == [1, None]
 
 
 def test_leaving_frees_the_seat_at_once(served):

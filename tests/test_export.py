@@ -14,11 +14,13 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pytest
+from commands import refused
 from hypothesis import strategies
 from hypothesis.extra import numpy as arrays
 from pyarrow import parquet
 
 import fleetjax
+from fleetjax import cli, envs
 from fleetjax.envs import EnvSpec
 from fleetjax.fleet import Interventions
 from fleetjax.io import export, folder, interventions
@@ -90,6 +92,7 @@ def tree(path: Path) -> dict[str, bytes]:
 
 def test_nothing_but_the_data_set_is_written(made):
     assert all(list(path.parent.iterdir()) == [path] for path in made.values())
+    assert set(tree(made["minari"])) == {"data/main_data.hdf5", "data/metadata.json"}
     assert set(tree(made["lerobot"])) == {
         "data/chunk-000/file-000.parquet",
         "meta/episodes/chunk-000/file-000.parquet",
@@ -383,6 +386,82 @@ def test_an_older_data_set_and_what_a_killed_export_left_are_replaced(kind, tmp_
     assert list(tmp_path.iterdir()) == [output]
     assert set(tree(tmp_path)) == set(first)
     assert tree(tmp_path) != first
+
+
+@pytest.mark.parametrize("kind", export.FORMATS)
+def test_an_older_data_set_comes_back_if_the_new_one_cannot_be_put_there(kind, tmp_path, monkeypatch):
+    spec, output = SPECS["continuous"], tmp_path / "fleet"
+    export.export(make_interventions(spec), CONFIG, spec, output, kind)
+    before, rename = tree(tmp_path), Path.replace
+
+    def fail_for_the_new(path, target):
+        if path.parent.name == ".fleet.partial":
+            raise OSError(28, "No space left on device")
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "replace", fail_for_the_new)
+    with pytest.raises(OSError, match="No space left"):
+        export.export(make_interventions(spec)[:1], CONFIG, spec, output, kind)
+    assert tree(tmp_path) == before
+    assert list(tmp_path.iterdir()) == [output]
+
+
+@pytest.fixture
+def run(tmp_path) -> Path:
+    """A finished run whose log has interventions."""
+    path = tmp_path / "runs" / "navigation"
+    path.mkdir(parents=True)
+    log = np.concatenate(make_interventions(envs.make("navigation").spec))
+    (path / interventions.FILE).write_bytes(log.tobytes())
+    folder.write_config(folder.Run(path, CONFIG, 0, logged=True), sealed=True)
+    return path
+
+
+def exported(run: Path, kind: str, output: Path) -> Path:
+    assert cli.main(["export", str(run), "--format", kind, "--output", str(output), "--overwrite"]) == 0
+    return output
+
+
+@pytest.mark.parametrize("kind", export.FORMATS)
+def test_what_no_export_of_the_format_wrote_is_not_overwritten(kind, run, tmp_path, capsys):
+    thesis, link, empty = tmp_path / "thesis", tmp_path / "link", tmp_path / "empty"
+    for part in ("meta", "data"):
+        (thesis / part).mkdir(parents=True)
+    (thesis / "meta/fleetjax.json").write_text("not JSON")
+    (thesis / "data/metadata.json").write_text('{"dataset_id": "precious-v0"}')
+    with h5py.File(tmp_path / "precious.hdf5", "w") as file:
+        file.create_group("data").attrs["total"] = 0
+    (tmp_path / "notes.txt").write_text("precious")
+    others = [exported(run, other, tmp_path / other) for other in export.FORMATS if other != kind]
+    link.symlink_to(exported(run, kind, tmp_path / kind))
+    empty.mkdir()
+    before = tree(tmp_path)
+    files = [tmp_path / "precious.hdf5", tmp_path / "notes.txt", run / folder.CONFIG]
+    capsys.readouterr()
+    for output in (run, run.parent, tmp_path, thesis, link, *others, *files):
+        reason = refused(capsys, "export", run, "--format", kind, "--output", output, "--overwrite")
+        assert f"{output} " in reason
+        assert "choose another --output" in reason
+        assert tree(tmp_path) == before
+    assert link.is_symlink()
+    exported(run, kind, tmp_path / kind)
+    exported(run, kind, empty)
+
+
+@pytest.mark.parametrize("kind", ["lerobot", "minari"])
+def test_notes_in_an_older_data_set_are_not_lost(kind, run, tmp_path, capsys):
+    output = exported(run, kind, tmp_path / "fleet")
+    (output / "data" / "notes.md").write_text("precious")
+    before = tree(tmp_path)
+    capsys.readouterr()
+    reason = refused(capsys, "export", run, "--format", kind, "--output", output, "--overwrite")
+    assert f"{output} also holds data/notes.md, which would be lost; move it, or choose another --output" in reason
+    assert tree(tmp_path) == before
+    (output / "data" / "notes.md").unlink()
+    (output / "link").symlink_to(run)
+    assert "also holds link" in refused(capsys, "export", run, "--format", kind, "--output", output, "--overwrite")
+    (output / "link").unlink()
+    exported(run, kind, output)
 
 
 @pytest.mark.parametrize("kind", export.FORMATS)

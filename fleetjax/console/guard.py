@@ -118,10 +118,22 @@ class Guard:
     def _is_here(self, hosts: list[str]) -> bool:
         """Return whether a request names this host, once. No other site's name can be an address."""
         try:
-            name = (urlsplit(f"//{hosts[0]}").hostname or "") if len(hosts) == 1 else ""
+            name, _ = _parts(hosts[0]) if len(hosts) == 1 else ("", None)
             return name in self.names or is_loopback(name) or (not self.local and bool(ipaddress.ip_address(name)))
         except ValueError:
             return False
+
+
+def _parts(host: str) -> tuple[str, int | None]:
+    """Return the name and the port in a Host header.
+
+    Raises:
+        ValueError: if it has other parts, or the port is none.
+    """
+    parts = urlsplit(f"//{host}")
+    if parts.netloc != host or "@" in host:
+        raise ValueError("a host has a name and a port")
+    return parts.hostname or "", parts.port
 
 
 def _same_host(origins: list[str], host: str) -> bool:
@@ -136,7 +148,8 @@ def _same_host(origins: list[str], host: str) -> bool:
 
 def _cookie_name(headers: Headers) -> str:
     """Return the name of the cookie; browsers send a host's cookies to all its ports."""
-    return f"fleetjax-{urlsplit('//' + headers['host']).port or ''}"
+    _, port = _parts(headers["host"])
+    return f"fleetjax-{port or ''}"
 
 
 def _cookie(headers: Headers) -> str:

@@ -68,15 +68,16 @@ class Seats:
             The seat, its key, and the client that had it open until now, if there is another.
 
         Raises:
-            Refused: if it is taken, or none is free.
+            Refused: if it is taken, none is free, or the client has another.
         """
-        for i, old in enumerate(self.seats):
-            if old.key and key and hmac.compare_digest(old.key.encode(), key.encode()):
-                before, old.client, old.heard, old.action = old.client, client, now, None
-                return i, old.key, before if before is not client else None
-        free = [i for i, other in enumerate(self.seats) if not other.key]
-        if self.of(client) is not None:
+        mine, kept = self.of(client), self._kept(key)
+        if mine not in (None, kept):
             raise Refused("you have a seat already")
+        if kept is not None:
+            old = self.seats[kept]
+            before, old.client, old.heard, old.action = old.client, client, now, None
+            return kept, old.key, before if before is not client else None
+        free = [i for i, other in enumerate(self.seats) if not other.key]
         if seat is not None and seat not in range(len(self.seats)):
             raise Refused(f"there is no seat {seat + 1}")
         if seat is not None and seat not in free:
@@ -86,6 +87,13 @@ class Seats:
         chosen = free[0] if seat is None else seat
         self.seats[chosen] = Seat(secrets.token_urlsafe(16), client, now)
         return chosen, self.seats[chosen].key, None
+
+    def _kept(self, key: str) -> int | None:
+        """Return the seat that belongs to a key."""
+        for i, seat in enumerate(self.seats):
+            if seat.key and hmac.compare_digest(seat.key.encode(), key.encode()):
+                return i
+        return None
 
     def of(self, client: Hashable) -> int | None:
         """Return the seat that a client has open."""

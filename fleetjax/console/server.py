@@ -166,7 +166,9 @@ class Console:
             sending.cancel()
 
     def _hear(self, client: Client, text: str | None) -> None:
-        """Do what a page asks for, or tell it why not."""
+        """Do what a page asks for, or tell it why not; one that is being closed is not heard any more."""
+        if client.closing:
+            return
         client.heard += 1
         if client.heard > MOST_MESSAGES:
             client.close(1008, "too many messages")

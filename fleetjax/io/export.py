@@ -4,6 +4,7 @@ import importlib.util
 import json
 import re
 import shutil
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -57,6 +58,13 @@ _ROBOMIMIC = {
 }
 _MINARI_INFOS = {"next_observation": "next_obs", "success": "success", "timeout": "timeout", **_EXTRAS}
 _FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+_FIRST = _FILE.format(chunk_index=0, file_index=0)
+# The files of the formats that are folders. One of them holds the mark: what `_source` returned.
+_FILES = {
+    "lerobot": {f"data/{_FIRST}", f"meta/episodes/{_FIRST}", "meta/tasks.parquet"}
+    | {f"meta/{name}.json" for name in ("info", "stats", "fleetjax")},
+    "minari": {"data/main_data.hdf5", "data/metadata.json"},
+}
 _GYM = 2  # robomimic's number for environments that it makes through Gym
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
@@ -75,7 +83,7 @@ def check(kind: str) -> None:
 
 
 def export(interventions: list[np.ndarray], config: Config, spec: EnvSpec, output: Path, kind: str) -> None:
-    """Write interventions as a data set, whole or not at all; what was at `output` goes.
+    """Write interventions as a data set, whole or not at all; an older export of the same format at `output` is replaced.
 
     Args:
         interventions: records [T] of each, as `interventions.split` returns them.
@@ -85,22 +93,74 @@ def export(interventions: list[np.ndarray], config: Config, spec: EnvSpec, outpu
         kind: one of `FORMATS`.
 
     Raises:
-        ValueError: if there are none, or a library is not installed.
+        ValueError: if there are none, a library is not installed, or something else is at `output`.
     """
     check(kind)
     if not interventions:
         raise ValueError("the log holds no interventions; nothing was exported")
+    _check_output(output, kind)
     partial = output.with_name(f".{output.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir()
     try:
         written = partial / output.name
         _WRITERS[kind](interventions, config, spec, written)
-        if output.is_dir():
-            shutil.rmtree(output)
-        written.replace(output)
+        _put(written, output)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def _check_output(output: Path, kind: str) -> None:
+    """Check that nothing is lost by an export: it may replace an empty folder, or an older export and nothing more.
+
+    Raises:
+        ValueError: if something else is there.
+    """
+    if output.is_symlink():
+        raise ValueError(f"{output} is a link, which an export does not replace; choose another --output")
+    if not output.exists() or (output.is_dir() and not any(output.iterdir())):
+        return
+    if not _is_export(output, kind):
+        raise ValueError(f"{output} was not exported by fleetjax as {kind}, so it is not replaced; choose another --output")
+    for path in sorted(output.rglob("*")):
+        name = path.relative_to(output).as_posix()
+        if path.is_symlink() or not (path.is_dir() or name in _FILES[kind]):
+            raise ValueError(f"{output} also holds {name}, which would be lost; move it, or choose another --output")
+
+
+def _is_export(path: Path, kind: str) -> bool:
+    """Return whether a file or folder bears the mark that exports of a format leave."""
+    try:
+        if kind == "robomimic":
+            import h5py  # pyright: ignore[reportMissingImports]  an extra
+
+            with h5py.File(path) as file:
+                source = json.loads(str(file["data"].attrs["fleetjax"]))
+        elif kind == "minari":
+            source = json.loads((path / "data/metadata.json").read_bytes())["fleetjax"]
+        else:
+            source = json.loads((path / "meta/fleetjax.json").read_bytes())
+        return "version" in source and "config" in source
+    except (OSError, KeyError, TypeError, ValueError, RecursionError):
+        return False
+
+
+def _put(written: Path, output: Path) -> None:
+    """Rename a data set to `output`; what was there goes when the new one is in place, and comes back if that fails."""
+    if not output.exists():
+        written.replace(output)
+        return
+    aside = Path(tempfile.mkdtemp(prefix=f".{output.name}.", dir=output.parent))
+    old = aside / output.name
+    try:
+        output.replace(old)
+        written.replace(output)
+    except BaseException:
+        if old.exists():
+            old.replace(output)
+        aside.rmdir()
+        raise
+    shutil.rmtree(aside, ignore_errors=True)
 
 
 def _columns(records: np.ndarray) -> dict[str, np.ndarray]:
@@ -122,9 +182,8 @@ def _write_lerobot(interventions: list[np.ndarray], config: Config, spec: EnvSpe
 
     rate = max(1, round(1 / spec.control_step))
     frames = _frames(interventions, rate)
-    first = _FILE.format(chunk_index=0, file_index=0)
-    _write_parquet(path / "data" / first, {name: _arrow(x) for name, x in frames.items()})
-    _write_parquet(path / "meta/episodes" / first, _episodes(frames, [len(records) for records in interventions], spec.name))
+    _write_parquet(path / "data" / _FIRST, {name: _arrow(x) for name, x in frames.items()})
+    _write_parquet(path / "meta/episodes" / _FIRST, _episodes(frames, [len(records) for records in interventions], spec.name))
     tasks = pd.Index([spec.name], dtype=object, name="task")
     pd.DataFrame({"task_index": [0]}, index=tasks).to_parquet(path / "meta/tasks.parquet", engine="pyarrow")
     info = {

@@ -119,7 +119,7 @@ def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser
         type=Path,
         help="folder, or .hdf5 file for robomimic [default: RUN/FORMAT or RUN/robomimic.hdf5]",
     )
-    export.add_argument("--overwrite", action="store_true", help="replace what is there")
+    export.add_argument("--overwrite", action="store_true", help="replace an older export of the same format")
 
     render = commands.add_parser("render", help="draw robots as an animation", description=_RENDER_ABOUT)
     render.add_argument("source", metavar="RUN|ENV", help="run folder, or environment")

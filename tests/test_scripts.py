@@ -1,0 +1,148 @@
+"""Every script in benchmarks/ and experiments/ prints and writes what it should, with arguments that make it small."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from commands import TINY, make_metrics
+
+import fleetjax
+from fleetjax.io import folder
+
+ROOT = Path(__file__).parents[1]
+SCRIPTS = sorted(
+    path.relative_to(ROOT).as_posix()
+    for part in ("benchmarks", "experiments")
+    for path in (ROOT / part).glob("*.py")
+    if "\ndef main(" in path.read_text()
+)
+FLEET = " ".join(TINY)
+PPO = "num_envs=8 num_eval_envs=2 episode_length=10 unroll_length=4 batch_size=8 num_minibatches=2"
+
+
+class Case(NamedTuple):
+    """How a script is tried.
+
+    Attributes:
+        commands: its arguments, of one run after the other.
+        prints: regular expressions, each of which is found in what it prints, line by line.
+        writes: files that are there afterwards.
+        prepare: what is called with the working folder before.
+        quick: whether it is done in about 15 s.
+    """
+
+    commands: tuple[str, ...]
+    prints: tuple[str, ...]
+    writes: tuple[str, ...] = ()
+    prepare: Callable[[Path], None] = lambda place: None
+    quick: bool = False
+
+
+def row(*cells: str) -> str:
+    """Return a regular expression for a line of a Markdown table that begins with these cells."""
+    return r"^\|" + "".join(rf" +{cell} +\|" for cell in cells)
+
+
+def make_runs(place: Path) -> None:
+    """Write what `human_time.py` reads: two finished runs."""
+    config = fleetjax.make_config("navigation", num_robots=6, num_humans=2, num_steps=40)
+    for seed in range(2):
+        path = place / f"run-{seed}"
+        path.mkdir()
+        log = folder.open_metrics(path)
+        folder.append_metrics(log, make_metrics(seed, 40), 0)
+        log.close()
+        folder.write_config(folder.Run(path, config, seed), sealed=True)
+
+
+CASES = {
+    "benchmarks/console.py": Case(("--pages 3 --ticks 10 --robots 4",), (row("3", r"\d+", r"[\d.]+", r"[\d.]+"),)),
+    "benchmarks/fleet_step.py": Case(
+        (f"humanoid --steps 2 --repeats 1 -- {FLEET}",), (row("humanoid", r"\d+ %", r"[\d.]+", r"[\d.]+"),)
+    ),
+    "benchmarks/physics.py": Case(
+        ("humanoid --num-robots 4 --largest-mjx 0 --repeats 1",),
+        (row("humanoid", "4", "raw rollout", r"[\d,]+", "1.00"), row("humanoid", "4", "native", r"[\d,]+", r"[\d.]+")),
+        quick=True,
+    ),
+    "benchmarks/scaling.py": Case(
+        ("--environments navigation --num-robots 2 --num-seeds 1 --largest-navigation 10",),
+        (row("navigation", "10", r"[\d.]+"), row("2", "1", r"[\d.]+", "1.00"), row("x10", r"[\d.]+"), row("navigation", "1")),
+    ),
+    "benchmarks/soak.py": Case(
+        (f"--kills 1 --checkpoint-every 0 -- {FLEET} --num-steps 1000",),
+        (r"^\d+ rounds, [1-9]\d* kills survived, 0 starts from t > 0, \d+ timesteps lost in all$", "^results differing: 0$"),
+    ),
+    "benchmarks/startup.py": Case(
+        (f"--environments navigation --run-steps 4 -- {FLEET}",), (row("navigation", *[r"\d+\.\d+"] * 4),)
+    ),
+    "experiments/block_push.py": Case(
+        (f"--algorithms constraint --seeds 0 -- {FLEET} --num-steps 4 --augmented-copies 1 --extra-demonstrations 0",),
+        (row("block_push", "Constraint", r"\d+"), r"^runs/block_push/block_push\.png$"),
+        ("runs/block_push/block_push.png", "runs/block_push/block_push-constraint-0/metrics.csv"),
+    ),
+    "experiments/clone_error.py": Case(
+        ("humanoid --demonstrations 256 --fresh 100 --gradient-steps 2",),
+        (row("256", *[r"\d\.\d{4}"] * 3), r"^variance of the expert's actions: 0\.\d+", r"^error of repeating .*: 0\.\d+"),
+        quick=True,
+    ),
+    "experiments/first_look.py": Case(
+        (
+            f"--environments navigation --algorithms random --seeds 0 1 --output looks -- {FLEET}",
+            "--environments navigation --algorithms expert --output alone -- --num-robots 4 --num-steps 4",
+        ),
+        (row("navigation", "Random", r"\d+ ± \d+"), row("navigation", "Expert", r"\d+"), r"^looks/first_look\.png$"),
+        ("looks/first_look.png", "alone/first_look.png", "looks/navigation-random-1/policy.msgpack"),
+    ),
+    "experiments/human_time.py": Case(
+        ("run-0 run-1",),
+        (r"^run-1: \d+ of 80 human timesteps, [\d.]+ %$", r"^mean \d+; .* random_threshold 0\.\d{5}$"),
+        prepare=make_runs,
+        quick=True,
+    ),
+    "experiments/settle_cubes.py": Case(
+        ("--number 4 --output settled.npz",), (r"^\d+ of \d+ cubes came to rest near the goal$",), ("settled.npz",), quick=True
+    ),
+    "experiments/train_expert.py": Case(
+        (
+            f"humanoid --output expert --num-timesteps 64 --evaluate-every 64 --settings {PPO}",
+            "humanoid --output expert --ship --weights weights --candidates 1 --num-episodes 2",
+        ),
+        (r"^\{'steps': 64, ", r"^shipped \{'environment': 'humanoid', 'steps': 64, 'num_episodes': 2"),
+        ("expert/curve.csv", "expert/checkpoint_0000000064.msgpack", *(f"weights/humanoid{x}" for x in (".npz", "_curve.csv"))),
+    ),
+}
+
+
+def repository() -> dict[str, int]:
+    """Return when the files that scripts could write were changed last."""
+    parts = [ROOT / part for part in ("benchmarks", "experiments", "fleetjax")]
+    paths = [path for part in parts for path in part.rglob("*") if path.is_file() and path.parent.name != "__pycache__"]
+    return {str(path): path.stat().st_mtime_ns for path in [*paths, *ROOT.glob("*")] if path.is_file()}
+
+
+def test_every_script_has_its_case():
+    assert list(CASES) == SCRIPTS
+
+
+@pytest.mark.parametrize("script", [pytest.param(s, marks=[] if c.quick else pytest.mark.slow) for s, c in CASES.items()])
+def test_a_script_runs_and_gives_what_it_should(script, tmp_path):
+    case, before, printed = CASES[script], repository(), ""
+    case.prepare(tmp_path)
+    for arguments in case.commands:
+        command = [sys.executable, ROOT / script, *shlex.split(arguments)]
+        quick = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
+        done = subprocess.run(command, cwd=tmp_path, env=os.environ | quick, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        printed += done.stdout
+    for pattern in case.prints:
+        assert re.search(pattern, printed, re.MULTILINE), printed
+    for name in case.writes:
+        assert (tmp_path / name).stat().st_size > 0
+    assert repository() == before

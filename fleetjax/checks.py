@@ -77,8 +77,8 @@ def check_memory(config: Config, env: Env) -> None:
     if needed > limit:
         largest = max(parts, key=lambda name: parts[name])
         raise ValueError(
-            f"{largest} = {getattr(config, largest)} is too large: the run needs at least {needed / _GIB:,.1f} GiB of memory "
-            f"({parts[largest] / _GIB:,.1f} of them for this), and there are {limit / _GIB:,.1f}"
+            f"{largest} = {getattr(config, largest)} is too large: the run needs at least {needed / _GIB:,.2f} GiB of memory, "
+            f"{parts[largest] / _GIB:,.2f} of them for this, and there are {limit / _GIB:,.2f}"
         )
 
 
@@ -134,7 +134,7 @@ def _layout(state: FleetState) -> FleetState:
 
     def describe(x: Any) -> Any:
         if isinstance(x, Buffer):
-            return Buffer(jax.tree.map(lambda rows: _struct(rows, 1), x.rows), _struct(x.added))
+            return x._replace(rows=jax.tree.map(lambda rows: _struct(rows, 1), x.rows), added=_struct(x.added))
         return _struct(x)
 
     data = state.human_data

@@ -172,10 +172,14 @@ def _check_whole(name: str, array: "jax.Array | np.ndarray") -> None:
         ValueError: if they do not, or are floats so large that they may stand for another whole number.
     """
     is_float = jnp.issubdtype(array.dtype, jnp.floating)
-    values = np.asarray(array, np.float64) if _is_concrete(array) else None
-    if is_float and (values is None or not np.all(np.isfinite(values) & (values == np.round(values)))):
+    if not _is_concrete(array):
+        if is_float:
+            raise ValueError(f"{name} = {array} must be a whole number of {FIELDS[name].unit}")
+        return
+    values = np.asarray(array, np.float64)
+    if not np.all(np.isfinite(values) & (values == np.round(values))):
         raise ValueError(f"{name} = {array} must be a whole number of {FIELDS[name].unit}")
-    if values is not None and np.any(np.abs(values) > _LARGEST):
+    if np.any(np.abs(values) > _LARGEST):
         raise ValueError(f"{name} = {array} must lie within 32 bits")
     if is_float and np.any(np.abs(values) > _LARGEST_EXACT):
         raise ValueError(f"{name} = {array} is a float beyond 2^24, where floats skip whole numbers; pass an int")

@@ -249,7 +249,7 @@ def make_fleet(config: Config, env: Env) -> Fleet:
         after, (metrics, _) = logged_step(state, key)
         return after, metrics
 
-    return Fleet(*map(in_32_bits, (plan, advance, step, logged_step)))
+    return Fleet(in_32_bits(plan), in_32_bits(advance), in_32_bits(step), in_32_bits(logged_step))
 
 
 def _make_learning(config: Config, learner: imitation.Learner, critics: dict[str, critic.Critic]) -> Callable[..., Any]:

@@ -2,19 +2,20 @@
 
 import functools
 from collections.abc import Callable
-from typing import TypeVar
+from typing import ParamSpec, TypeVar
 
 import jax
 
-Function = TypeVar("Function", bound=Callable)
+Parameters = ParamSpec("Parameters")
+Returned = TypeVar("Returned")
 
 
-def in_32_bits(function: Function) -> Function:
+def in_32_bits(function: Callable[Parameters, Returned]) -> Callable[Parameters, Returned]:
     """Return a function that traces with 32-bit defaults, so that a program is the same with `JAX_ENABLE_X64` and without."""
 
     @functools.wraps(function)
-    def wrapped(*args, **kwargs):
+    def wrapped(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Returned:
         with jax.enable_x64(False):
             return function(*args, **kwargs)
 
-    return wrapped  # pyright: ignore[reportReturnType]  the same signature
+    return wrapped

@@ -1,8 +1,13 @@
 """Parameters and commands that cannot be used cost one line on stderr and exit code 2, and touch nothing."""
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 from commands import contents, refused
 
+import fleetjax
+from fleetjax import checks, supervisors
 from fleetjax.config import Config
 from fleetjax.io import files
 
@@ -36,6 +41,14 @@ BAD_RUNS = {
     "no layers": ((*RUN, "--hidden-sizes", 0), "hidden_sizes = (0,)"),
     "seed": ((*RUN, "--seed", -1), "--seed: '-1' must be a whole number from 0 to 4294967295"),
     "large seed": ((*RUN, "--seed", 2**32), "--seed: '4294967296' must be a whole number"),
+    "another's supervisor": (
+        (*RUN, "--supervisor", "humanoid"),
+        "supervisor = 'humanoid' does not fit environment = 'navigation': it cannot act on its states",
+    ),
+    "too large networks": (
+        (*RUN, "--hidden-sizes", 10**9, 10**9),
+        "hidden_sizes = (1000000000, 1000000000) is too large: the run needs at least",
+    ),
     "few humans for expert": ((*RUN, "--algorithm", "expert", "--num-humans", 3), "must equal num_robots"),
 }
 
@@ -69,9 +82,51 @@ def test_other_commands_refuse_in_one_line(arguments, reason, capsys):
     assert reason in refused(capsys, *arguments)
 
 
-def test_integers_beyond_32_bits_are_refused():
-    with pytest.raises(ValueError, match="initial_period = 1099511627776 must lie within 32 bits"):
-        Config().replace(initial_period=2**40)
+@pytest.mark.parametrize(
+    ("name", "value", "reason"),
+    [
+        ("initial_period", 2**40, "initial_period = 1099511627776 must lie within 32 bits"),
+        ("initial_period", 2**70, "must lie within 32 bits"),
+        ("num_demonstrations", np.int64(2**32 + 500), "num_demonstrations = 4294967796 must lie within 32 bits"),
+        ("num_demonstrations", np.array([500, 2**32 + 500]), "must lie within 32 bits"),
+        ("num_demonstrations", 16777217.0, "num_demonstrations = 16777217.0 is a float beyond 2.24.*pass an int"),
+        ("num_demonstrations", 500.5, "num_demonstrations = 500.5 must be a whole number of pairs"),
+        ("num_demonstrations", np.nan, "must be a whole number"),
+        ("num_demonstrations", True, "num_demonstrations = True must be a number"),
+        ("learning_rate", 1j, "learning_rate = 1j must be a number"),
+        ("learning_rate", None, "learning_rate = None must be a number"),
+        ("normalize_observations", 1, "normalize_observations = 1 must be True or False"),
+    ],
+)
+def test_numbers_that_a_field_cannot_hold_are_refused(name, value, reason):
+    with pytest.raises(ValueError, match=reason):
+        Config().replace(**{name: value})
+
+
+def test_numbers_that_a_field_can_hold_are_kept():
+    config = Config().replace(num_demonstrations=np.int64(2**31 - 1), initial_period=500.0, learning_rate=np.float64(0.1))
+    assert (int(config.num_demonstrations), int(config.initial_period)) == (2**31 - 1, 500)
+    assert float(config.learning_rate) == np.float32(0.1)
+
+
+def test_a_supervisor_whose_actions_have_another_size_is_refused(monkeypatch):
+    monkeypatch.setitem(supervisors._SUPERVISORS, "wide", lambda env: fleetjax.Supervisor(lambda state, key: jnp.zeros(3)))
+    with pytest.raises(ValueError, match=r"'wide' does not fit .*'navigation': it gives \(3,\), and actions have \(2,\)"):
+        fleetjax.make_config("navigation", supervisor="wide")
+
+
+def test_a_run_that_cannot_fit_the_memory_is_refused_with_both_numbers(monkeypatch):
+    config = fleetjax.make_config("navigation", "cur", critic_capacity=1_000_000)
+    needed = (
+        r"critic_capacity = 1000000 is too large: the run needs at least 0\.0[1-9] GiB of memory, 0\.0[1-9] of .* are 0\.00"
+    )
+    monkeypatch.setattr(checks, "_memory", lambda: 1000)
+    with pytest.raises(ValueError, match=needed):
+        jax.eval_shape(fleetjax.run, config, jax.random.key(0))
+    state = checks.state_shapes(config, fleetjax.envs.make("navigation"))
+    held = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
+    monkeypatch.setattr(checks, "_memory", lambda: 2 * held)
+    checks.check_run(config)
 
 
 def test_a_disk_that_fails_costs_one_line(monkeypatch, tmp_path, capsys):

@@ -60,3 +60,11 @@ def test_pixel_values_come_to_unit_scale():
 def test_images_that_patches_do_not_fit_are_refused():
     with pytest.raises(ValueError, match=r"image_shape = \(10, 12, 3\) must have height and width that 4 divides"):
         networks.make_network(SPEC._replace(image_shape=(10, 12, 3)), (16,), 2)
+
+
+def test_observations_are_clipped_at_ten_deviations_and_only_where_they_are_normalised():
+    obs = jnp.array([[0.0, 100.0], [2.0, 100.0], [1e6, -1e6]])
+    fitted = networks.fit_normalizer(obs[:2], jnp.int32(2), enabled=True)
+    np.testing.assert_allclose(fitted(obs), [[-1.0, 0.0], [1.0, 0.0], [10.0, -10.0]])  # the second entry never varies
+    identity = networks.fit_normalizer(obs[:2], jnp.int32(2), enabled=False)
+    np.testing.assert_array_equal(identity(obs), obs)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from fleetjax.envs.base import Env
+from fleetjax.precision import in_32_bits
 from fleetjax.supervisors import expert
 from fleetjax.types import EnvState
 
@@ -79,6 +80,7 @@ def list_supervisors() -> tuple[str, ...]:
     return tuple(_SUPERVISORS)
 
 
+@in_32_bits
 def check(name: str, env: Env) -> None:
     """Check that a supervisor is registered and can act in an environment; nothing is computed.
 

@@ -82,7 +82,7 @@ def _run(arguments: argparse.Namespace) -> None:
             raise ValueError(f"checkpoint_every = {arguments.checkpoint_every} must be 0 (none) or at least 2 timesteps")
         run = _to_resume(arguments, overrides) if arguments.resume else _to_begin(arguments, overrides)
     if not arguments.resume:
-        folder.check_free(run.folder, overwrite=arguments.overwrite)
+        folder.check_folder(run.folder, overwrite=arguments.overwrite)
         run.folder.mkdir(parents=True, exist_ok=True)
     with files.lock(run.folder):
         _run_in(run, resume=bool(arguments.resume), checkpoint_every=arguments.checkpoint_every)
@@ -132,37 +132,13 @@ def _run_in(run: folder.Run, *, resume: bool, checkpoint_every: int) -> None:
     if metrics:
         say(f"{run.folder} is finished; there is nothing to go on with")
     else:
-        folder.write_config(run, sealed=False) if resume else folder.create(run)
-        metrics = _operate(run, resume=resume, checkpoint_every=checkpoint_every)
+        metrics = operation.operate(run, resume=resume, checkpoint_every=checkpoint_every, save=_save)
     _report(run, metrics, f"{text.duration(time.monotonic() - begun)} in all")
 
 
 def _report(run: folder.Run, metrics: Metrics, last: str) -> None:
     print(f"\n{text.headline(run.config, run.seed)}\n\n{text.run_table(metrics, run.config)}\n")
     print(f"{last}. Run folder: {run.folder}")
-
-
-def _operate(run: folder.Run, *, resume: bool, checkpoint_every: int) -> Metrics:
-    """Run what is left, and write what it gave."""
-    try:
-        metrics, state = operation.operate(run, resume=resume, checkpoint_every=checkpoint_every)
-    except (KeyboardInterrupt, operation.Diverged):
-        _keep(run)
-        raise
-    if get_algorithm(run.config.algorithm).pretrains:
-        folder.write_policy(run.folder, state.learner)
-    _save(run, metrics)
-    return metrics
-
-
-def _keep(run: folder.Run) -> None:
-    """Draw what an interrupted run has; remove its folder if that is nothing."""
-    path = run.folder / folder.METRICS
-    data = path.read_bytes() if path.exists() else b""
-    if data.count(b"\n") < 2:  # the head alone
-        folder.discard(run.folder)
-        raise KeyboardInterrupt("before the first timestep; nothing was kept") from None
-    _save(run, folder.parse_metrics(data, run.config.num_steps))
 
 
 def _save(run: folder.Run, metrics: Metrics) -> None:
@@ -296,7 +272,7 @@ def _console(arguments: argparse.Namespace) -> None:
             arguments.interval = envs.make(run.config.environment, run.config.backend).spec.control_step
         names = ("host", "port", "token", "interval", "timeout", "wait")
         command.check(run.config, **{name: getattr(arguments, name) for name in names})
-    folder.check_free(run.folder, overwrite=arguments.overwrite)
+    folder.check_folder(run.folder, overwrite=arguments.overwrite)
 
     from fleetjax.console import server
 
@@ -304,7 +280,7 @@ def _console(arguments: argparse.Namespace) -> None:
     with contextlib.closing(server.listen(arguments.host, arguments.port)) as listener:
         run.folder.mkdir(parents=True, exist_ok=True)
         with files.lock(run.folder):
-            metrics = command.supervise(run, options, listener, lambda metrics: _save(run, metrics))
+            metrics = command.supervise(run, options, listener, _save)
     _report(run, metrics, f"{text.plural(len(metrics.successes), 'timestep')} recorded")
 
 

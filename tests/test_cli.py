@@ -131,7 +131,7 @@ def test_existing_folders_and_files_are_not_overwritten(copied, tmp_path, capsys
     file.write_text("precious")
     assert "exists already" in refused(capsys, *RUN, "--output", file)
     assert "exists already" in refused(capsys, "plot", copied, "--output", file)
-    assert "File exists" in refused(capsys, *RUN, "--output", file, "--overwrite")
+    assert "is not a run folder" in refused(capsys, *RUN, "--output", file, "--overwrite")
     assert file.read_text() == "precious"
     assert contents(copied) == before
 
@@ -197,8 +197,12 @@ def test_list_shows_environments_and_algorithms(capsys):
 def test_parameters_arrive_as_they_are_typed(monkeypatch, tmp_path):
     made = []
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(cli.folder, "create", lambda run: made.append((run.config, run.seed)))
-    monkeypatch.setattr(cli, "_operate", lambda *arguments, **options: (_ for _ in ()).throw(OSError("stop here")))
+
+    def operate(run, **options):
+        made.append((run.config, run.seed))
+        raise OSError("stop here")
+
+    monkeypatch.setattr(cli.operation, "operate", operate)
     flags = ["--hidden-sizes", "16", "8", "--no-normalize-observations", "--num-steps", "1e3", "--risk-threshold", ".25"]
     fleet = ["--algorithm", "expert", "--num-robots", "7", "--backend", "native"]
     assert cli.main(["run", "navigation", *fleet, "--seed", "4294967295", *flags]) == 2

@@ -396,9 +396,12 @@ def test_a_port_in_use_and_a_folder_in_use_are_refused(capsys, tmp_path):
     assert not (tmp_path / "run").exists()
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "mine").write_text("precious")
-    assert "exists already" in refused(capsys, "console", "navigation", "--port", "0", "--output", tmp_path / "run")
+    console = ("console", "navigation", "--port", "0", "--output", tmp_path / "run")
+    assert "is not a run folder" in refused(capsys, *console, "--overwrite")
+    (tmp_path / "run" / "config.json").touch()
+    assert "exists already" in refused(capsys, *console)
     with files.lock(tmp_path / "run"):
-        said = refused(capsys, "console", "navigation", "--port", "0", "--overwrite", "--output", tmp_path / "run")
+        said = refused(capsys, *console, "--overwrite")
     assert "is in use by process" in said
 
 
@@ -541,6 +544,23 @@ def test_ctrl_c_before_the_first_timestep_leaves_nothing(tmp_path, port_of, caps
     stopper.join()
     assert "nothing was kept" in capsys.readouterr().err
     assert not path.exists()
+
+
+def test_an_older_run_stays_until_the_first_timestep(tmp_path, monkeypatch, port_of, capsys):
+    path = tmp_path / "run"
+    path.mkdir()
+    older = {"config.json": b"{}", "metrics.csv": b"precious", "mine": b"mine"}
+    restore(path, older)
+    console = ["console", "navigation", *flags(num_steps=1), "--port", "0", "--output", str(path), "--overwrite"]
+    stopper = threading.Thread(target=lambda: (port_of(), knock(port_of()), os.kill(os.getpid(), signal.SIGINT)))
+    stopper.start()
+    assert cli.main(console) == 130
+    stopper.join()
+    assert f"before the first timestep; {path} is as it was" in capsys.readouterr().err
+    assert contents(path) == older
+    assert cli.main([*console, "--wait", "0"]) == 0
+    assert set(contents(path)) == {"config.json", "metrics.csv", "figure.png", "policy.msgpack", "console.bin", "mine"}
+    assert cli.main(["replay", str(path)]) == 0
 
 
 def knock(port: int) -> None:

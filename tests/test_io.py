@@ -15,7 +15,7 @@ from commands import make_metrics
 from hypothesis import strategies
 
 import fleetjax
-from fleetjax.io import execution, files, folder
+from fleetjax.io import checkpoint, execution, files, folder
 from fleetjax.learning.imitation import make_learner
 from fleetjax.learning.networks import Normalizer
 from fleetjax.metrics import Metrics
@@ -179,13 +179,34 @@ def test_default_folders_are_new(tmp_path, monkeypatch, config):
 
 
 def test_overwriting_spares_what_fleetjax_did_not_write(saved, config):
+    checkpoints = saved / checkpoint.FOLDER
+    (checkpoints / "0000000007").mkdir(parents=True)
+    (checkpoints / "0000000007" / "data").write_text("a run's")
+    for name in ("0000000008", "kept-0000000007", "00000000070"):
+        path = checkpoints / name / "mine" if name != "0000000008" else checkpoints / name  # here a file
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("mine")
     (saved / "notes.txt").write_text("mine")
-    with pytest.raises(FileExistsError, match="--overwrite"):
-        folder.check_free(saved, overwrite=False)
-    folder.check_free(saved, overwrite=True)
     folder.create(folder.Run(saved, config, 6))
-    assert {path.name for path in saved.iterdir()} == {"config.json", "notes.txt"}
+    assert {path.name for path in saved.iterdir()} == {"config.json", "notes.txt", "checkpoints"}
+    assert {path.name for path in checkpoints.iterdir()} == {"0000000008", "kept-0000000007", "00000000070"}
     assert folder.read_run(saved).seed == 6
+
+
+def test_only_a_run_is_overwritten(saved, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("mine")
+    for path in (tmp_path / "mine", tmp_path / "mine" / "notes.txt"):
+        for overwrite in (False, True):
+            with pytest.raises(FileExistsError, match="exists already and is not a run folder"):
+                folder.check_folder(path, overwrite=overwrite)
+    with pytest.raises(FileExistsError, match="--overwrite"):
+        folder.check_folder(saved, overwrite=False)
+    (saved / "config.json").write_text("{")
+    folder.check_folder(saved, overwrite=True)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / files.LOCK).touch()  # as a kill may leave it
+    folder.check_folder(tmp_path / "empty", overwrite=False)
 
 
 @hypothesis.given(strategies.integers(1, 200_000), strategies.integers(2, 5_000) | strategies.none())

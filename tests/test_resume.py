@@ -222,10 +222,10 @@ def test_a_checkpoint_that_cannot_be_used_is_named_and_the_older_one_taken(stopp
 def test_without_a_whole_checkpoint_nothing_is_touched(stopped, capsys):
     for path in (stopped / checkpoint.FOLDER).iterdir():
         flip(path)
-    metrics = (stopped / "metrics.csv").read_bytes()
+    before = everything(stopped)
     assert run_here("run", "--resume", stopped) == 2
     assert "has no checkpoint that could be used" in capsys.readouterr().err.splitlines()[-1]
-    assert (stopped / "metrics.csv").read_bytes() == metrics
+    assert everything(stopped) == before
     assert steps_of(stopped) == [60, 66]
 
 
@@ -298,6 +298,71 @@ def test_a_folder_in_use_is_refused(stopped, whole, capsys):
     assert steps_of(stopped) == [60, 66]
     assert run_here("run", "--resume", stopped) == 0
     assert not (stopped / files.LOCK).exists()
+    assert_same(stopped, whole)
+
+
+def everything(path: Path) -> dict[str, bytes]:
+    """Return the files of a folder, and of its folders, by path; a lock is none of them."""
+    found = [file for file in path.rglob("*") if file.is_file() and file.name != files.LOCK]
+    return {str(file.relative_to(path)): file.read_bytes() for file in found}
+
+
+OVERWRITE = ("run", "navigation", *TINY, "--seed", "4", "--overwrite", "--output")
+
+
+def test_a_run_that_cannot_begin_overwrites_nothing(stopped):
+    before = everything(stopped)
+    with contextlib.suppress(TypeError):  # if validation lets it pass, its shapes do not
+        assert run_here(*OVERWRITE, stopped, "--supervisor", "humanoid") == 2
+    assert everything(stopped) == before
+
+
+@pytest.mark.parametrize("where", ["start", "go_on"])
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_what_stops_a_run_before_its_first_chunk_overwrites_nothing(stopped, monkeypatch, capsys, where, error):
+    before, seen = everything(stopped), []
+
+    def stop(*arguments, **options):
+        seen.append(everything(stopped))  # what a kill would leave
+        raise error
+
+    monkeypatch.setattr(operation.execution, where, stop)
+    if error is RuntimeError:
+        with pytest.raises(RuntimeError):
+            run_here(*OVERWRITE, stopped)
+    else:
+        assert run_here(*OVERWRITE, stopped) == 130
+        assert f"interrupted before the first timestep; {stopped} is as it was" in capsys.readouterr().err
+    assert seen == [before]
+    assert everything(stopped) == before
+
+
+def test_an_older_run_goes_with_the_first_chunk_and_ctrl_c_in_it_still_spares_it(stopped, monkeypatch):
+    before, real = everything(stopped), operation.execution.go_on
+
+    def go_on(*arguments, **options):
+        for number, chunk in enumerate(real(*arguments, **options)):
+            assert (everything(stopped) == before) == (number == 0)
+            if interrupted:
+                signal.raise_signal(signal.SIGINT)
+            yield chunk
+
+    monkeypatch.setattr(operation.execution, "go_on", go_on)
+    for interrupted, code in ((True, 130), (False, 0)):
+        assert run_here(*OVERWRITE, stopped) == code
+        assert (everything(stopped) == before) == interrupted
+    assert folder.read_run(stopped).seed == 4
+    assert not (stopped / checkpoint.FOLDER).exists()
+    assert set(contents(stopped)) == {"config.json", "metrics.csv", "figure.png", "policy.msgpack"}
+
+
+def test_a_run_that_is_stopped_before_its_first_checkpoint_is_read_resumes_later(stopped, whole, monkeypatch):
+    before = everything(stopped)
+    with monkeypatch.context() as patch:
+        patch.setattr(operation.execution, "shapes", lambda *arguments: (_ for _ in ()).throw(KeyboardInterrupt))
+        assert run_here("run", "--resume", stopped) == 130
+    assert everything(stopped) == before
+    assert run_here("run", "--resume", stopped) == 0
     assert_same(stopped, whole)
 
 

@@ -90,6 +90,19 @@ class Writer:
                 shutil.rmtree(other)
 
 
+def clear(folder: Path) -> None:
+    """Remove the checkpoints of a run; what others left among them stays."""
+    for path in _found(folder):
+        shutil.rmtree(path)
+    with contextlib.suppress(OSError):  # there is no such folder, or it holds files of others
+        (folder / FOLDER).rmdir()
+
+
+def _found(folder: Path) -> list[Path]:
+    """Return the checkpoints of a run, finished or not, oldest first."""
+    return sorted(path for path in (folder / FOLDER).glob("[0-9]" * 10) if path.is_dir() and not path.is_symlink())
+
+
 def restore(
     folder: Path, identity: Mapping[str, Any], shapes: FleetState, check: Callable[[Mapping[str, Any]], Any]
 ) -> tuple[Checkpoint | None, list[str]]:

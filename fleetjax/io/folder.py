@@ -10,8 +10,8 @@ import io
 import itertools
 import json
 import math
+import os
 import re
-import shutil
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -76,12 +76,43 @@ def check_free(path: Path, *, overwrite: bool) -> None:
     raise FileExistsError(f"{path} exists already; choose another --output, or pass --overwrite")
 
 
+def is_run(path: Path) -> bool:
+    """Return whether a folder holds a run, be it damaged."""
+    return (path / CONFIG).exists()
+
+
+def check_folder(path: Path, *, overwrite: bool) -> None:
+    """Check that a run can be written to a folder without loss of anything but an older run.
+
+    Raises:
+        FileExistsError: if something is there that is neither an empty folder nor, with `overwrite`, a run.
+    """
+    if not os.path.lexists(path) or (path.is_dir() and {found.name for found in path.iterdir()} <= {files.LOCK}):
+        return
+    if not is_run(path):
+        raise FileExistsError(f"{path} exists already and is not a run folder; choose another --output")
+    if not overwrite:
+        raise FileExistsError(f"{path} exists already; choose another --output, or pass --overwrite")
+
+
+def prepare(run: Run) -> bool:
+    """Write the configuration of a new run, unless the folder holds a run: that one stays until `create`.
+
+    Returns:
+        bool: whether the folder held no run.
+    """
+    new = not is_run(run.folder)
+    if new:
+        write_config(run, sealed=False)
+    return new
+
+
 def create(run: Run) -> None:
     """Write the configuration of a new run; an older run in the folder goes."""
-    for name in (CONFIG, FIGURE, EVALUATION, *DATA):
+    checkpoint.clear(run.folder)
+    write_config(run, sealed=False)  # before data go: if killed in between, this run can be resumed, from the start
+    for name in (FIGURE, EVALUATION, *DATA):
         (run.folder / name).unlink(missing_ok=True)
-    shutil.rmtree(run.folder / checkpoint.FOLDER, ignore_errors=True)
-    write_config(run, sealed=False)
 
 
 def discard(path: Path) -> None:

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import re
 import resource
 import shutil
 import signal
@@ -216,6 +217,55 @@ def test_a_checkpoint_that_cannot_be_used_is_named_and_the_older_one_taken(stopp
     assert said[0].startswith(f"left out {stopped / 'checkpoints' / '0000000066'}: ")
     assert reason in said[0]
     assert said[1] == f"going on from {stopped / 'checkpoints' / '0000000060'}"
+    assert_same(stopped, whole)
+
+
+EMPTY = {"size": 0, "sha256": files.digest(b"")}
+MANIFESTS = [
+    b"",
+    b"\xff\xfe",
+    b"[" * 200_000,
+    b'{"notes": ' * 200_000,
+    b"null",
+    b"7",
+    {"notes": 7},
+    {"notes": {}},
+    {"notes": {"metrics": 7}},
+    {"notes": {"metrics": {"size": "many"}}},
+    {"notes": {"metrics": {"size": -1, "sha256": None}}},
+    {"notes": {"metrics": {"size": 10**40, "sha256": []}}},
+    {"notes": {"metrics": EMPTY, "interventions": EMPTY}},
+    {"sha256": 7},
+    {"sha256": {"../../metrics.csv": 7}},
+    {"timestep": {}},
+    {"config": 7},
+]
+
+
+def test_every_malformed_manifest_is_passed_over_with_the_reason(stopped):
+    run, path = folder.read_run(stopped), newest(stopped)
+    intact = json.loads((path / checkpoint.MANIFEST).read_text())
+    shown: list[str] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(operation, "say", shown.append)
+        for manifest in MANIFESTS:
+            data = manifest if isinstance(manifest, bytes) else json.dumps(intact | manifest).encode()
+            (path / checkpoint.MANIFEST).write_bytes(data)
+            start = operation._resume(run, jax.random.key(3), 2)
+            assert int(start.state.timestep) == 60, data[:50]
+            reason, chosen = shown[-2:]
+            assert re.fullmatch(rf"left out {re.escape(str(path))}: [\w ,'.-]+", reason), reason
+            assert chosen.endswith("0000000060")
+
+
+def test_what_others_leave_among_the_checkpoints_stays_and_does_no_harm(stopped, whole):
+    (stopped / checkpoint.FOLDER / ".DS_Store").write_text("stray")
+    (stopped / checkpoint.FOLDER / "9999999999").write_text("stray")
+    (stopped / checkpoint.FOLDER / "mine").mkdir()
+    assert run_here("run", "--resume", stopped, "--checkpoint-every", 30) == 0
+    assert steps_of(stopped) == [66, 96]
+    names = {path.name for path in (stopped / checkpoint.FOLDER).iterdir()}
+    assert names == {".DS_Store", "9999999999", "mine", "0000000066", "0000000096"}
     assert_same(stopped, whole)
 
 

@@ -115,17 +115,19 @@ class Log:
             self._file.close()
 
 
-def beginning(path: Path, mark: Mapping[str, Any]) -> bytes:
+def beginning(path: Path, mark: Any) -> bytes:
     """Return what a file held when it was marked.
 
     Raises:
         ValueError: if it does not hold it any more.
     """
-    size, wanted = mark.get("size"), mark.get("sha256")
-    if not path.is_file() or not isinstance(size, int):
+    size = mark.get("size") if isinstance(mark, Mapping) else None
+    if not isinstance(size, int):
+        raise ValueError(f"{path.name} is not noted there")
+    if not path.is_file():
         raise ValueError(f"{path.name} is missing")
     with path.open("rb") as file:
-        data = file.read(size)
-    if digest(data) != wanted:
+        data = file.read(min(size, path.stat().st_size))
+    if digest(data) != mark.get("sha256"):
         raise ValueError(f"{path.name} is not as it was at that time")
     return data

@@ -279,6 +279,7 @@ def parse_metrics(data: bytes, num_steps: int) -> Metrics:
     Raises:
         ValueError: if it is not a run's of at most `num_steps` timesteps.
     """
+    _expect(bool(data), "it is empty")
     head, *rows = csv.reader(io.StringIO(data.decode()))
     _expect(head == list(_COLUMNS), "its columns are not those of this version of fleetjax")
     _expect(0 < len(rows) <= num_steps, f"{len(rows)} rows for {num_steps} timesteps")

@@ -198,9 +198,11 @@ def _resume(run: folder.Run, key: jax.Array, length: int) -> Start:
     """Read the newest checkpoint that is whole, and say which are not."""
     logs = {"metrics": folder.METRICS} | ({"interventions": interventions.FILE} if run.logged else {})
 
-    def check(notes: Mapping[str, Any]) -> None:
-        for name, file in logs.items():
-            files.beginning(run.folder / file, notes[name])
+    def check(found: checkpoint.Checkpoint) -> None:
+        data = {name: files.beginning(run.folder / file, found.notes.get(name)) for name, file in logs.items()}
+        timestep = int(found.state.timestep)
+        if len(folder.parse_metrics(data["metrics"], timestep).successes) != timestep:
+            raise ValueError(f"{folder.METRICS} had fewer timesteps at that time")
 
     identity = folder.identity(run.config, run.seed)
     found, refused = checkpoint.restore(run.folder, identity, execution.shapes(run.config, key), check)

@@ -78,7 +78,7 @@ def test_the_configuration_is_plain_json_with_seed_and_versions(saved):
     assert content["config"]["hidden_sizes"] == [8]
     assert content["config"]["normalize_observations"] is True
     assert content["seed"] == 5
-    assert set(content["versions"]) == {"fleetjax", "jax", "mujoco"}
+    assert content["versions"] == [{"timestep": 0, **folder.versions()}]
     assert not [path.name for path in saved.iterdir() if path.name.endswith(".partial")]
 
 
@@ -126,6 +126,49 @@ DAMAGES = {
     "other shapes": (lambda run: change(run / "config.json", hidden_sizes=[9]), "shapes"),
     "other layers": (lambda run: change(run / "config.json", hidden_sizes=[8, 8]), "policy.msgpack cannot be used"),
 }
+
+
+SINCE_0 = {"timestep": 0, "fleetjax": "1", "jax": "2", "mujoco": "3"}
+
+
+@pytest.mark.parametrize(
+    "versions",
+    [
+        None,
+        folder.versions(),
+        [],
+        [7],
+        [folder.versions()],
+        [SINCE_0 | {"jax": 7}],
+        [SINCE_0 | {"timestep": "0"}],
+        [SINCE_0 | {"timestep": 1}],
+        [SINCE_0 | {"timestep": -1}, SINCE_0],
+        [SINCE_0, SINCE_0],
+        [SINCE_0, SINCE_0 | {"timestep": 9}, SINCE_0 | {"timestep": 8}],
+    ],
+)
+def test_damaged_versions_are_refused(saved, versions):
+    content = json.loads((saved / "config.json").read_text())
+    (saved / "config.json").write_text(json.dumps(content | {"versions": versions}))
+    with pytest.raises(ValueError, match="its versions are not"):
+        folder.read_run(saved)
+
+
+def test_versions_are_listed_from_the_timestep_on_from_which_they_ran(saved, monkeypatch):
+    run = folder.read_run(saved)
+    assert folder.resumed(run, 8) == run
+    entries = [{"timestep": 0, **folder.versions()}]
+    for timestep, jax_version in ((8, "a"), (12, "a"), (20, "b")):
+        monkeypatch.setattr(jax, "__version__", jax_version)
+        run = folder.resumed(run, timestep)
+        if timestep != 12:  # nothing has changed
+            entries.append({"timestep": timestep, **folder.versions()})
+        assert list(run.versions) == entries
+    folder.write_config(run, sealed=True)
+    assert folder.read_run(saved).versions == run.versions
+    assert list(folder.resumed(run, 20).versions) == entries
+    monkeypatch.setattr(jax, "__version__", "a")
+    assert list(folder.resumed(run, 20).versions) == entries[:2]
 
 
 def read_all(path: Path) -> None:

@@ -269,6 +269,32 @@ def test_what_others_leave_among_the_checkpoints_stays_and_does_no_harm(stopped,
     assert_same(stopped, whole)
 
 
+def test_other_versions_are_told_and_listed(stopped, whole, monkeypatch, capsys):
+    versions = folder.versions()
+    with monkeypatch.context() as patch:
+        patch.setattr(jax, "__version__", "0.0.1")
+        patch.setattr(operation, "progress", interrupt_after(4))
+        assert run_here("run", "--resume", stopped, "--checkpoint-every", 0) == 130
+        expected = f"before t = 66 this run used jax {versions['jax']}; it resumes with jax 0.0.1, so its numbers may not be "
+        assert f"\n{expected}an undisturbed run's\n" in capsys.readouterr().err
+    entries = [{"timestep": 0, **versions}, {"timestep": 66, **versions, "jax": "0.0.1"}]
+    assert list(folder.read_run(stopped).versions) == entries
+    assert steps_of(stopped) == [66, 74]
+    assert run_here("run", "--resume", stopped) == 0
+    assert "before t = 74 this run used jax 0.0.1; it resumes with jax" in capsys.readouterr().err
+    assert list(folder.read_run(stopped).versions) == [*entries, {"timestep": 74, **versions}]
+    assert_same(stopped, whole)
+
+
+def test_a_run_that_starts_again_begins_its_list_of_versions_anew(stopped, whole):
+    shutil.rmtree(stopped / checkpoint.FOLDER)
+    run = folder.read_run(stopped)
+    folder.write_config(run._replace(versions=({**run.versions[0], "jax": "0.0.1"},)), sealed=False)
+    assert run_here("run", "--resume", stopped) == 0
+    assert folder.read_run(stopped).versions == run.versions
+    assert_same(stopped, whole)
+
+
 def test_without_a_whole_checkpoint_nothing_is_touched(stopped, capsys):
     for path in (stopped / checkpoint.FOLDER).iterdir():
         flip(path)

@@ -48,6 +48,7 @@ class Run(NamedTuple):
         seed: the seed of its key.
         logged: whether interventions are logged.
         digests: SHA-256 by file name.
+        versions: what it ran under, in order, each with the `timestep` from which on; nothing before it begins.
     """
 
     folder: Path
@@ -55,6 +56,7 @@ class Run(NamedTuple):
     seed: int
     logged: bool = False
     digests: Mapping[str, str] = {}
+    versions: tuple[Mapping[str, Any], ...] = ()
 
 
 def default_folder(config: Config, seed: int) -> Path:
@@ -130,11 +132,24 @@ def versions() -> dict[str, str]:
     return {"fleetjax": VERSION, "jax": jax.__version__, "mujoco": mujoco.__version__}
 
 
+def resumed(run: Run, timestep: int) -> Run:
+    """Return a run as it resumes at a timestep: with today's versions from there on, if they are not those before."""
+    before = [entry for entry in run.versions if entry["timestep"] < timestep]
+    now = {"timestep": timestep, **versions()}
+    return run._replace(versions=(*before, *([now] if changes(before[-1], now) else [])))
+
+
+def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Return the names of what has another version now."""
+    return [name for name in versions() if before[name] != now[name]]
+
+
 def write_config(run: Run, *, sealed: bool) -> None:
     """Write `config.json`: every field, the seed, versions, and the SHA-256 of the data files that are there, if `sealed`."""
     data = {name: run.folder / name for name in DATA}
     digests = {name: files.digest(path.read_bytes()) for name, path in data.items() if sealed and path.exists()}
-    content = {"log_interventions": run.logged, "versions": versions(), "sha256": digests}
+    ran_under = run.versions or [{"timestep": 0, **versions()}]
+    content = {"log_interventions": run.logged, "versions": ran_under, "sha256": digests}
     files.write_json(run.folder / CONFIG, identity(run.config, run.seed) | content)
 
 
@@ -209,7 +224,8 @@ def read_run(folder: Path) -> Run:
             raise ValueError(f"seed = {seed!r} must be a whole number")
         if not isinstance(digests, dict):
             raise ValueError("the SHA-256 of the data files are missing")
-        return Run(folder, _from_plain(content["config"]), seed, content.get("log_interventions") is True, digests)
+        logged, ran_under = content.get("log_interventions") is True, _versions_from(content.get("versions"))
+        return Run(folder, _from_plain(content["config"]), seed, logged, digests, ran_under)
 
 
 def read_finished(run: Run) -> Metrics | None:
@@ -236,6 +252,21 @@ def _from_plain(fields: Mapping[str, Any]) -> Config:
     config = Config().replace(**fields)
     validate(config)
     return config
+
+
+def _versions_from(entries: Any) -> tuple[Mapping[str, Any], ...]:
+    """Return the versions that a run ran under.
+
+    Raises:
+        ValueError: if they are not such a list, in order from t = 0 on.
+    """
+    kinds = {"timestep": int, **dict.fromkeys(versions(), str)}
+    sound = isinstance(entries, list) and all(isinstance(entry, dict) and entry.keys() == kinds.keys() for entry in entries)
+    if sound and all(_fits(entry[name], kind) for entry in entries for name, kind in kinds.items()):
+        timesteps = [entry["timestep"] for entry in entries]
+        if timesteps[:1] == [0] and timesteps == sorted(set(timesteps)):
+            return tuple(entries)
+    raise ValueError("its versions are not a list of those that it ran under, from t = 0 on")
 
 
 def _expect(holds: bool, otherwise: str) -> None:

@@ -77,11 +77,13 @@ class Start(NamedTuple):
     """Where an operation starts.
 
     Attributes:
+        run: the run, with the versions that it goes on under.
         state: the fleet.
         metrics: Metrics[t] so far, in numpy arrays; None at t = 0.
         notes: what the journal noted then; None at t = 0.
     """
 
+    run: folder.Run
     state: FleetState
     metrics: Metrics | None
     notes: Mapping[str, Any] | None
@@ -105,11 +107,15 @@ def operate(run: folder.Run, *, resume: bool, checkpoint_every: int, save: Calla
         Diverged: if what is learnt is not finite any more.
         KeyboardInterrupt: if it was asked to stop; the message says how to go on.
     """
-    new = folder.prepare(run)
+    begun, new = time.monotonic(), folder.prepare(run)
     say(f"{text.headline(run.config, run.seed)}, on the {jax.default_backend().upper()} ...")
+    length = execution.chunk_length(run.config.num_steps, checkpoint_every)
     gathered: list[Metrics] = []
     try:
-        state = _go_on(run, gathered, resume=resume, overwrite=not (new or resume), checkpoint_every=checkpoint_every)
+        start = (_resume if resume else _begin)(run, jax.random.key(run.seed), length)
+        run = start.run
+        say(f"ready after {text.duration(time.monotonic() - begun)}")
+        state = _go_on(start, gathered, length, overwrite=not (new or resume), checkpoint_every=checkpoint_every)
     except (KeyboardInterrupt, Diverged):
         if not gathered:
             raise unbegun(run, new=new) from None
@@ -122,12 +128,10 @@ def operate(run: folder.Run, *, resume: bool, checkpoint_every: int, save: Calla
     return metrics
 
 
-def _go_on(run: folder.Run, gathered: list[Metrics], *, resume: bool, overwrite: bool, checkpoint_every: int) -> FleetState:
-    """Run what is left, and gather the Metrics[C] of every chunk that is written; return the last state."""
-    begun, key, total = time.monotonic(), jax.random.key(run.seed), run.config.num_steps
-    length = execution.chunk_length(total, checkpoint_every)
-    state, before, notes = _resume(run, key, length) if resume else _begin(run, key, length)
-    say(f"ready after {text.duration(time.monotonic() - begun)}")
+def _go_on(start: Start, gathered: list[Metrics], length: int, *, overwrite: bool, checkpoint_every: int) -> FleetState:
+    """Run what is left, and gather the Metrics of what is written, chunk after chunk; return the last state."""
+    run, state, before, notes = start
+    key, total = jax.random.key(run.seed), run.config.num_steps
     done = saved = int(state.timestep)
     writer = checkpoint.Writer(run.folder, folder.identity(run.config, run.seed))
     chunks = execution.go_on(run.config, key, state, execution.chunks_of(total - done, length), logged=run.logged)
@@ -191,7 +195,7 @@ def _begin(run: folder.Run, key: jax.Array, length: int) -> Start:
     first = "pre-training" if get_algorithm(run.config.algorithm).pretrains else "preparing"
     say(f"compiling and {first} ...")
     state = execution.start(run.config, key, min(length, run.config.num_steps), logged=run.logged)
-    return Start(state, None, None)
+    return Start(run._replace(versions=()), state, None, None)
 
 
 def _resume(run: folder.Run, key: jax.Array, length: int) -> Start:
@@ -216,7 +220,18 @@ def _resume(run: folder.Run, key: jax.Array, length: int) -> Start:
     say(f"going on from {found.path}")
     data = files.beginning(run.folder / folder.METRICS, found.notes["metrics"])
     metrics = folder.parse_metrics(data, run.config.num_steps)
-    return Start(found.state, metrics, found.notes)
+    return Start(_updated(run, int(found.state.timestep)), found.state, metrics, found.notes)
+
+
+def _updated(run: folder.Run, timestep: int) -> folder.Run:
+    """Return a run with the versions that it goes on under; say so if they are others than before."""
+    run = folder.resumed(run, timestep)
+    if run.versions[-1]["timestep"] == timestep:
+        before, now = run.versions[-2:]
+        names = folder.changes(before, now)
+        old, new = (", ".join(f"{name} {entry[name]}" for name in names) for entry in (before, now))
+        say(f"before t = {timestep} this run used {old}; it resumes with {new}, so its numbers may not be an undisturbed run's")
+    return run
 
 
 @contextlib.contextmanager

@@ -208,8 +208,8 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     metrics = execution.join(chunks)
     total = {name: np.sum(getattr(metrics, name)).item() for name in _EVALUATED}
     content = {"num_steps": config.num_steps, "seed": seed, "totals": total, "versions": folder.versions()}
+    print(text.evaluation_table(metrics, config), flush=True)  # the disk may have filled up meanwhile
     files.write_json(output, content)
-    print(text.evaluation_table(metrics, config))
 
 
 def _export(arguments: argparse.Namespace) -> None:
@@ -219,7 +219,7 @@ def _export(arguments: argparse.Namespace) -> None:
         found = folder.read_interventions(run)
     name = "robomimic.hdf5" if arguments.format == "robomimic" else arguments.format
     output = arguments.output or run.folder / name
-    folder.check_free(output, overwrite=arguments.overwrite)
+    folder.check_free(output, overwrite=arguments.overwrite, is_folder=arguments.format != "robomimic")
     with _refusing():
         export.export(found, run.config, envs.make(run.config.environment, run.config.backend).spec, output, arguments.format)
     steps = sum(map(len, found))

@@ -15,7 +15,7 @@ from commands import STEPS, TINY, contents, refused
 
 import fleetjax
 from fleetjax import cli
-from fleetjax.io import folder
+from fleetjax.io import figure, folder, render
 
 
 @pytest.fixture(scope="module")
@@ -119,6 +119,48 @@ def test_evaluation_is_the_librarys(copied, capsys):
     assert contents(copied) == before
     assert cli.main(["evaluate", str(copied), "--num-steps", "16", "--overwrite"]) == 0
     assert json.loads((copied / "evaluation.json").read_text())["seed"] == 4  # not the training's 3
+
+
+def test_an_evaluation_is_shown_even_if_it_cannot_be_stored(copied, monkeypatch, capsys):
+    full = OSError(28, "No space left on device", "evaluation.json")
+    monkeypatch.setattr(cli.files, "write_json", lambda *arguments: (_ for _ in ()).throw(full))
+    assert cli.main(["evaluate", str(copied), "--num-steps", "16"]) == 2
+    printed = capsys.readouterr()
+    assert printed.out.splitlines()[-1].startswith("C.U.R. ")
+    assert printed.err.splitlines()[-1] == "fleetjax: evaluation.json: No space left on device"
+
+
+def fail(*arguments, **options):
+    raise AssertionError("something was computed")
+
+
+def test_outputs_that_cannot_be_written_are_refused_before_anything_is_computed(copied, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(render, "start", fail)
+    monkeypatch.setattr(figure, "draw", fail)
+    monkeypatch.setattr(cli.execution, "start_evaluation", fail)
+    monkeypatch.setattr(folder, "read_interventions", lambda run: [])
+    monkeypatch.setattr(cli.export, "export", fail)
+    file = tmp_path / "file"
+    file.touch()
+    commands = {"png": ("plot", copied), "gif": ("render", "navigation"), "hdf5": ("export", copied, "--format", "robomimic")}
+    for suffix, command in commands.items():
+        taken = tmp_path / f"taken.{suffix}"
+        taken.mkdir()
+        places = {
+            tmp_path / "nowhere" / f"x.{suffix}": f"{tmp_path / 'nowhere'} does not exist",
+            file / f"x.{suffix}": f"{file} is not a folder",
+            Path(f"/proc/x.{suffix}"): f"/proc/x.{suffix} cannot be written: No such file or directory",
+            taken: f"{taken} is a folder",
+        }
+        for output, reason in places.items():
+            assert reason in refused(capsys, *command, "--output", output, "--overwrite")
+    assert f"{file} is a file" in refused(capsys, "export", copied, "--format", "minari", "--output", file, "--overwrite")
+    before = contents(copied)
+    read_only = OSError(30, "Read-only file system")
+    monkeypatch.setattr(cli.files.tempfile, "NamedTemporaryFile", lambda **options: (_ for _ in ()).throw(read_only))
+    said = refused(capsys, "evaluate", copied)
+    assert f"{copied / 'evaluation.json'} cannot be written: Read-only file system" in said
+    assert contents(copied) == before
 
 
 RUN = ("run", "navigation")

@@ -67,15 +67,23 @@ def default_folder(config: Config, seed: int) -> Path:
     return next(p for p in itertools.chain([path], others) if not p.exists())
 
 
-def check_free(path: Path, *, overwrite: bool) -> None:
-    """Check that a folder or file can be written without loss.
+def check_free(path: Path, *, overwrite: bool, is_folder: bool = False) -> None:
+    """Check that an output can be written without loss, before it is computed.
+
+    Args:
+        path: where it shall go.
+        overwrite: whether it may replace what is there.
+        is_folder: whether it is a folder; else it is a file.
 
     Raises:
         FileExistsError: if something is there, and it is no empty folder, unless `overwrite`.
+        OSError: if it cannot be written there.
     """
-    if not path.exists() or overwrite or (path.is_dir() and not any(path.iterdir())):
-        return
-    raise FileExistsError(f"{path} exists already; choose another --output, or pass --overwrite")
+    if path.exists() and not overwrite and not (is_folder and path.is_dir() and not any(path.iterdir())):
+        raise FileExistsError(f"{path} exists already; pass --overwrite to replace it")
+    if path.exists() and path.is_dir() != is_folder:
+        raise FileExistsError(f"{path} is a {'file' if path.is_file() else 'folder'}; choose another --output")
+    files.check_place(path)
 
 
 def is_run(path: Path) -> bool:

@@ -5,6 +5,7 @@ What cannot be used is refused with one line on stderr and exit code 2, before a
 
 import argparse
 import contextlib
+import io
 import os
 import sys
 import time
@@ -48,6 +49,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         "console": _console,
         "replay": _replay,
     }
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a name may hold characters that its encoding lacks
     try:
         arguments = flags.parse(sys.argv[1:] if argv is None else argv)
         commands[arguments.command](arguments)

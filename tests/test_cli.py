@@ -1,5 +1,6 @@
 """The command line: what it prints and writes, and that its chunks change nothing."""
 
+import io
 import json
 import shutil
 import signal
@@ -161,6 +162,18 @@ def test_outputs_that_cannot_be_written_are_refused_before_anything_is_computed(
     said = refused(capsys, "evaluate", copied)
     assert f"{copied / 'evaluation.json'} cannot be written: Read-only file system" in said
     assert contents(copied) == before
+
+
+def test_characters_that_an_encoding_lacks_are_replaced(copied, tmp_path, monkeypatch):
+    path = copied.rename(tmp_path / "rün")
+    for name in ("stdout", "stderr"):
+        monkeypatch.setattr(sys, name, io.TextIOWrapper(io.BytesIO(), "ascii", write_through=True))
+    assert cli.main(["plot", str(path), "--output", str(path / "all.svg")]) == 0
+    assert cli.main(["plot", str(path), "--output", str(path / "all.svg")]) == 2
+    for stream, end in ((sys.stdout, b"r?n/all.svg"), (sys.stderr, b"replace it")):
+        shown = stream.buffer.getvalue()
+        assert b"r?n" in shown
+        assert shown.strip().endswith(end)
 
 
 RUN = ("run", "navigation")

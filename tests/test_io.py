@@ -194,6 +194,7 @@ def test_damaged_and_foreign_folders_are_refused_with_the_reason(saved, name):
         ("\n7,", "\n7,7,", "metrics.csv cannot be used"),
         ("\n7,", "\n7,x", "metrics.csv cannot be used"),
         ("\n7,", "\n7,99999999999", "metrics.csv cannot be used"),
+        ("\n7,", f"\n7,{200_000 * '1'}", "metrics.csv cannot be used: field larger than field limit"),
     ],
 )
 def test_metrics_that_make_no_sense_are_refused_even_where_the_digest_fits(saved, config, old, new, reason):

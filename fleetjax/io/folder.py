@@ -212,7 +212,7 @@ def _blame(path: Path) -> Iterator[None]:
         raise ValueError(f"{path} is missing: not the folder of a finished run") from None
     except RecursionError:
         raise ValueError(f"{path} is damaged: nested too deeply") from None
-    except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, csv.Error) as error:
         raise ValueError(f"{path} cannot be used: {error}") from None
 
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from fleetjax import envs
 from fleetjax.config import FIELDS, Config, make_config, validate
+from fleetjax.console.controls import CONTROLS
 from fleetjax.console.replaying import Disagreement
 from fleetjax.envs import get_defaults, list_envs
 from fleetjax.io import execution, export, files, flags, folder, operation, text
@@ -99,7 +100,9 @@ def _to_begin(arguments: argparse.Namespace, given: Mapping[str, Any]) -> folder
         ValueError: if the configuration cannot be used.
     """
     if "environment" not in given:
-        raise ValueError(f"ENV is missing; choose one of {', '.join(list_envs())}, or go on with a run by --resume RUN")
+        known = CONTROLS if arguments.command == "console" else list_envs()
+        resume = ", or resume a run with --resume RUN" if arguments.command == "run" else ""
+        raise ValueError(f"ENV is missing; choose one of {', '.join(known)}{resume}")
     overrides = {name: value for name, value in given.items() if name not in ("environment", "algorithm")}
     config, seed = make_config(given["environment"], given.get("algorithm", "cur"), **overrides), arguments.seed or 0
     return folder.Run(arguments.output or folder.default_folder(config, seed), config, seed, arguments.log_interventions)
@@ -178,7 +181,7 @@ def _plot(arguments: argparse.Namespace) -> None:
         figure.check_format(arguments.output)
         runs = [folder.read_run(path) for path in arguments.runs]
         data = [(run.config, run.seed, folder.read_metrics(run)) for run in runs]
-    folder.check_free(arguments.output, overwrite=arguments.overwrite)
+    output = folder.check_free(arguments.output, overwrite=arguments.overwrite)
     groups = figure.group(data)
     for run, (_, _, metrics) in zip(runs, data, strict=True):
         if len(metrics.successes) < run.config.num_steps:
@@ -187,7 +190,7 @@ def _plot(arguments: argparse.Namespace) -> None:
     if left_out:
         say(f"{text.plural(left_out, 'run')} left out: same settings and seed as a later one")
     drawn = figure.draw(groups)
-    files.write(arguments.output, figure.render(drawn, arguments.output.suffix))
+    files.write(output, figure.render(drawn, arguments.output.suffix))
     print(arguments.output)
 
 
@@ -199,8 +202,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
         if not get_algorithm(config.algorithm).pretrains:
             raise ValueError(f"algorithm = {config.algorithm!r} trains no policy that could be evaluated")
         learner = folder.read_policy(run)
-    output = run.folder / folder.EVALUATION
-    folder.check_free(output, overwrite=arguments.overwrite)
+    output = folder.check_free(run.folder / folder.EVALUATION, overwrite=arguments.overwrite)
     seed = (run.seed + 1) % 2**32 if arguments.seed is None else arguments.seed
     chunks: list[Metrics] = []
     say(f"{text.headline(config, seed)}, nobody teleoperates: compiling ...")
@@ -223,9 +225,9 @@ def _export(arguments: argparse.Namespace) -> None:
         found = folder.read_interventions(run)
     name = "robomimic.hdf5" if arguments.format == "robomimic" else arguments.format
     output = arguments.output or run.folder / name
-    folder.check_free(output, overwrite=arguments.overwrite, is_folder=arguments.format != "robomimic")
+    target = folder.check_free(output, overwrite=arguments.overwrite, is_folder=arguments.format != "robomimic")
     with _refusing():
-        export.export(found, run.config, envs.make(run.config.environment, run.config.backend).spec, output, arguments.format)
+        export.export(found, run.config, envs.make(run.config.environment, run.config.backend).spec, target, arguments.format)
     steps = sum(map(len, found))
     say(f"{text.plural(len(found), 'intervention')}, {text.plural(steps, 'timestep')} of human actions")
     print(output)
@@ -250,7 +252,7 @@ def _render(arguments: argparse.Namespace) -> None:
             config = make_config(config.environment, "expert", **shown, backend=config.backend)
         learner = folder.read_policy(run) if run and policy == "robot" else None
         render.check(config)
-    folder.check_free(arguments.output, overwrite=arguments.overwrite)
+    output = folder.check_free(arguments.output, overwrite=arguments.overwrite)
     seed = arguments.seed if arguments.seed is not None else run.seed if run else 0
     key = jax.random.key(seed)
     say(f"{text.headline(config, seed)}, policy {policy}: running ...")
@@ -261,7 +263,7 @@ def _render(arguments: argparse.Namespace) -> None:
     pictures = render.draw(film, env.scene, width=arguments.width, every=arguments.every)
     rate = 1 / (env.spec.control_step * arguments.every)
     with _refusing():
-        files.write(arguments.output, render.encode(pictures, arguments.output, rate=rate))
+        files.write(output, render.encode(pictures, arguments.output, rate=rate))
     print(arguments.output)
 
 

@@ -131,6 +131,18 @@ def test_an_evaluation_is_shown_even_if_it_cannot_be_stored(copied, monkeypatch,
     assert printed.err.splitlines()[-1] == "fleetjax: evaluation.json: No space left on device"
 
 
+def test_an_output_that_is_a_link_counts_and_its_target_is_written(copied, tmp_path, capsys):
+    link, target = tmp_path / "link.svg", tmp_path / "elsewhere" / "figure.svg"
+    target.parent.mkdir()
+    link.symlink_to(target)
+    for _ in range(2):  # a dangling link, then one that leads to a file
+        assert f"{link} exists already" in refused(capsys, "plot", copied, "--output", link)
+        assert cli.main(["plot", str(copied), "--output", str(link), "--overwrite"]) == 0
+        assert capsys.readouterr().out == f"{link}\n"
+        assert link.readlink() == target
+        assert target.read_bytes().startswith(b"<?xml")
+
+
 def fail(*arguments, **options):
     raise AssertionError("something was computed")
 

@@ -365,7 +365,7 @@ def test_beyond_this_machine_addresses_and_its_own_name_are_let_in_and_other_nam
         (["navigation", "--humans", "200"], "num_humans = 200"),
         (["navigation", "--fill", "robots"], "--fill"),
         (["navigation", "--checkpoint-every", "5"], "--checkpoint-every"),
-        ([], "ENV is missing"),
+        ([], "ENV is missing; choose one of navigation, block_push\n"),
     ],
 )
 def test_what_cannot_be_used_is_refused_in_one_line(arguments, reason, capsys, tmp_path, monkeypatch):

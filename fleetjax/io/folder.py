@@ -67,7 +67,7 @@ def default_folder(config: Config, seed: int) -> Path:
     return next(p for p in itertools.chain([path], others) if not p.exists())
 
 
-def check_free(path: Path, *, overwrite: bool, is_folder: bool = False) -> None:
+def check_free(path: Path, *, overwrite: bool, is_folder: bool = False) -> Path:
     """Check that an output can be written without loss, before it is computed.
 
     Args:
@@ -75,15 +75,20 @@ def check_free(path: Path, *, overwrite: bool, is_folder: bool = False) -> None:
         overwrite: whether it may replace what is there.
         is_folder: whether it is a folder; else it is a file.
 
+    Returns:
+        Path: where to write it: in place of a link, its target.
+
     Raises:
         FileExistsError: if something is there, and it is no empty folder, unless `overwrite`.
         OSError: if it cannot be written there.
     """
-    if path.exists() and not overwrite and not (is_folder and path.is_dir() and not any(path.iterdir())):
+    if os.path.lexists(path) and not overwrite and not (is_folder and path.is_dir() and not any(path.iterdir())):
         raise FileExistsError(f"{path} exists already; pass --overwrite to replace it")
     if path.exists() and path.is_dir() != is_folder:
         raise FileExistsError(f"{path} is a {'file' if path.is_file() else 'folder'}; choose another --output")
-    files.check_place(path)
+    target = Path(os.path.realpath(path))
+    files.check_place(target)
+    return target
 
 
 def is_run(path: Path) -> bool:

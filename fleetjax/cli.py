@@ -117,7 +117,7 @@ def _to_resume(arguments: argparse.Namespace, given: Mapping[str, Any]) -> folde
     if arguments.output or arguments.overwrite:
         raise ValueError("--resume goes on in the run's own folder; leave out --output and --overwrite")
     run = folder.read_run(arguments.resume)
-    if (run.folder / folder.RECORD).exists():
+    if folder.RECORD in run.digests or (run.folder / folder.RECORD).exists():
         raise ValueError(
             f"{run.folder} was supervised by people, who are not there any more; only `fleetjax replay` repeats it"
         )

@@ -377,6 +377,35 @@ def test_a_folder_in_use_is_refused(stopped, whole, capsys):
     assert_same(stopped, whole)
 
 
+def test_a_finished_run_that_lacks_a_file_is_not_called_finished(whole, tmp_path, capsys):
+    path = Path(shutil.copytree(whole, tmp_path / "copy"))
+    remedy = "repeat the run with --overwrite"
+    for name in RESULTS:
+        data = (path / name).read_bytes()
+        (path / name).unlink()
+        said = refused(capsys, "run", "--resume", path)
+        assert f"{path / name} is missing" in said
+        assert remedy in said
+        (path / name).write_bytes(data[:-1] + b"?")
+        said = refused(capsys, "run", "--resume", path)
+        assert f"{path / name} cannot be used: its SHA-256" in said
+        assert remedy in said
+        (path / name).write_bytes(data)
+    run = folder.read_run(path)
+    for name in ("policy.msgpack", "interventions.bin"):  # as if it had not been there when the run was sealed
+        data = (path / name).read_bytes()
+        (path / name).unlink()
+        folder.write_config(run, sealed=True)
+        assert f"{path / name} is missing" in refused(capsys, "run", "--resume", path)
+        (path / name).write_bytes(data)
+        said = refused(capsys, "run", "--resume", path)
+        assert f"{path / name} cannot be used: its SHA-256 is not in config.json" in said
+        assert remedy in said
+        folder.write_config(run, sealed=True)
+    assert run_here("run", "--resume", path) == 0
+    assert "is finished" in capsys.readouterr().err
+
+
 def everything(path: Path) -> dict[str, bytes]:
     """Return the files of a folder, and of its folders, by path; a lock is none of them."""
     found = [file for file in path.rglob("*") if file.is_file() and file.name != files.LOCK]

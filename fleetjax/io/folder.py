@@ -235,25 +235,33 @@ def read_run(folder: Path) -> Run:
         seed, digests = content.get("seed"), content.get("sha256")
         if not isinstance(seed, int) or not 0 <= seed < 2**32:
             raise ValueError(f"seed = {seed!r} must be a whole number")
-        if not isinstance(digests, dict):
-            raise ValueError("the SHA-256 of the data files are missing")
+        if not isinstance(digests, dict) or not digests.keys() <= set(DATA):
+            raise ValueError("the SHA-256 of the data files are missing, or are those of others")
         logged, ran_under = content.get("log_interventions") is True, _versions_from(content.get("versions"))
         return Run(folder, _from_plain(content["config"]), seed, logged, digests, ran_under)
 
 
 def read_finished(run: Run) -> Metrics | None:
-    """Read the metrics of a run that has all its timesteps, and the policy that it was to train; None if it has not.
+    """Read the metrics of a run that has all its timesteps; None if it has not.
 
     Raises:
-        ValueError: if what it has is damaged.
+        ValueError: if anything that such a run leaves is missing or damaged.
     """
     if METRICS not in run.digests:
         return None
-    metrics = read_metrics(run)
-    if len(metrics.successes) < run.config.num_steps:
-        return None
-    if get_algorithm(run.config.algorithm).pretrains:
-        read_policy(run)
+    try:
+        metrics = read_metrics(run)
+        if len(metrics.successes) < run.config.num_steps:
+            return None
+        for name in run.digests:
+            with _blame(run.folder / name):
+                _read_data(run, name)
+        if get_algorithm(run.config.algorithm).pretrains:
+            read_policy(run)
+        if run.logged:
+            read_interventions(run)
+    except ValueError as error:
+        raise ValueError(f"{error}; repeat the run with --overwrite") from None
     return metrics
 
 
@@ -302,6 +310,8 @@ def _fits(value: Any, kind: type) -> bool:
 def _read_data(run: Run, name: str) -> bytes:
     """Return the content of a data file that is as it was written."""
     data = (run.folder / name).read_bytes()
+    if METRICS in run.digests:
+        _expect(name in run.digests, "its SHA-256 is not in config.json, so it may be another run's")
     _expect(name in run.digests, f"the run is not finished; go on with it: fleetjax run --resume {run.folder}")
     _expect(run.digests.get(name) == files.digest(data), "its SHA-256 is not that in config.json, so it is damaged")
     return data

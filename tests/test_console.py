@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from commands import contents, refused
+from commands import contents, edit_config, refused
 from consoles import SMALL, claim, compile_once, flags, hear, make_config, make_session, say
 from websockets.sync.client import connect
 
@@ -514,9 +514,7 @@ def test_a_session_replays_to_the_bit_and_damage_is_refused(tmp_path, port_of, c
 def reseal(path, name: str, data: bytes) -> None:
     """Write a file with its digest, as a forger would."""
     (path / name).write_bytes(data)
-    content = json.loads((path / "config.json").read_text())
-    content["sha256"][name] = files.digest(data)
-    (path / "config.json").write_text(json.dumps(content))
+    edit_config(path, lambda content: content["sha256"].update({name: files.digest(data)}))
 
 
 def restore(path, original: dict[str, bytes]) -> None:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from commands import make_metrics
+from commands import edit_config, make_metrics
 from hypothesis import strategies
 
 import fleetjax
@@ -99,9 +99,13 @@ def flip(path: Path, place: int = -40) -> None:
 
 
 def change(path: Path, **fields) -> None:
-    content = json.loads(path.read_text())
-    content["config"] |= fields
-    path.write_text(json.dumps(content))
+    edit_config(path.parent, lambda content: content["config"].update(fields))
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    data = path.read_text()
+    assert old in data
+    path.write_text(data.replace(old, new))
 
 
 DAMAGES = {
@@ -116,7 +120,12 @@ DAMAGES = {
     "no text": (lambda run: (run / "config.json").write_bytes(b"\xff\xfe\x00"), "config.json cannot be used"),
     "deep JSON": (lambda run: (run / "config.json").write_text("[" * 200_000), "nested too deeply"),
     "a list": (lambda run: (run / "config.json").write_text("[1]"), "not fleetjax's"),
-    "a foreign file": (lambda run: (run / "config.json").write_text('{"config": {"lr": 1}}'), "seed = None"),
+    "a foreign file": (lambda run: (run / "config.json").write_text('{"config": {"lr": 1}}'), "no SHA-256 of its own"),
+    "sealed by others": (lambda run: edit_config(run, lambda content: content.pop("seed")), "seed = None"),
+    "other digests": (lambda run: edit_config(run, lambda content: content["sha256"].update(mine="")), "are those of others"),
+    "another robot": (lambda run: edit(run / "config.json", '"navigation"', '"humanoid"'), "it was edited or is damaged"),
+    "another version": (lambda run: edit(run / "config.json", '"mujoco": "', '"mujoco": "1'), "it was edited or is damaged"),
+    "sealed by hand": (lambda run: edit(run / "config.json", '"sha256_config": "', '"sha256_config": "0'), "it was edited"),
     "unknown field": (lambda run: change(run / "config.json", flux=1), "unknown fields: flux"),
     "wrong type": (lambda run: change(run / "config.json", num_robots="many"), "num_robots = 'many'"),
     "wrong list": (lambda run: change(run / "config.json", hidden_sizes=7), "hidden_sizes = 7"),
@@ -148,8 +157,7 @@ SINCE_0 = {"timestep": 0, "fleetjax": "1", "jax": "2", "mujoco": "3"}
     ],
 )
 def test_damaged_versions_are_refused(saved, versions):
-    content = json.loads((saved / "config.json").read_text())
-    (saved / "config.json").write_text(json.dumps(content | {"versions": versions}))
+    edit_config(saved, lambda content: content.update(versions=versions))
     with pytest.raises(ValueError, match="its versions are not"):
         folder.read_run(saved)
 

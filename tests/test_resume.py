@@ -16,7 +16,7 @@ import h5py
 import jax
 import numpy as np
 import pytest
-from commands import STEPS, TINY, contents, refused
+from commands import STEPS, TINY, contents, edit_config, refused
 
 import fleetjax
 from fleetjax import cli
@@ -361,9 +361,7 @@ def test_flags_that_contradict_the_run_are_refused(whole, capsys, arguments, rea
 def test_what_is_no_run_or_of_a_newer_version_is_refused(stopped, capsys, tmp_path):
     assert "is not a run folder: there is none" in refused(capsys, "run", "--resume", tmp_path / "nowhere")
     assert "ENV is missing" in refused(capsys, "run")
-    content = json.loads((stopped / "config.json").read_text())
-    content["config"]["flux"] = 1
-    (stopped / "config.json").write_text(json.dumps(content))
+    edit_config(stopped, lambda content: content["config"].update(flux=1))
     assert "unknown fields: flux (another version of fleetjax?)" in refused(capsys, "run", "--resume", stopped)
 
 

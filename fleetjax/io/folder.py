@@ -1,7 +1,7 @@
 """The folder of a run: configuration, per-timestep metrics, figure and trained policy.
 
-`config.json` is written when a run begins, and again last of all with the SHA-256 of the data files, which
-are refused if they do not match. Nothing is executed when it is read.
+`config.json` is written when a run begins, and again last of all with the SHA-256 of the data files, and always with
+that of its own content. What does not match is refused. Nothing is executed when it is read.
 """
 
 import contextlib
@@ -36,6 +36,7 @@ RECORD = "console.bin"  # what people did, where they supervised the run
 DATA = (METRICS, POLICY, interventions.FILE, RECORD)
 REALS = ("reward", "uncertainty", "policy_loss")  # the metrics that are no counts
 _COLUMNS = ("timestep", *Metrics._fields)
+_OWN_DIGEST = "sha256_config"
 _LARGEST = 2**31 - 1  # traced integers are i32
 
 
@@ -163,7 +164,13 @@ def write_config(run: Run, *, sealed: bool) -> None:
     digests = {name: files.digest(path.read_bytes()) for name, path in data.items() if sealed and path.exists()}
     ran_under = run.versions or [{"timestep": 0, **versions()}]
     content = {"log_interventions": run.logged, "versions": ran_under, "sha256": digests}
-    files.write_json(run.folder / CONFIG, identity(run.config, run.seed) | content)
+    files.write_json(run.folder / CONFIG, with_digest(identity(run.config, run.seed) | content))
+
+
+def with_digest(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of `config.json` with the SHA-256 of all else in it."""
+    rest = {name: value for name, value in content.items() if name != _OWN_DIGEST}
+    return rest | {_OWN_DIGEST: files.digest(json.dumps(rest, sort_keys=True).encode())}
 
 
 def to_plain(config: Config) -> dict[str, Any]:
@@ -232,6 +239,10 @@ def read_run(folder: Path) -> Run:
     with _blame(folder / CONFIG):
         content = json.loads((folder / CONFIG).read_bytes())
         _expect(isinstance(content, dict) and isinstance(content.get("config"), dict), "it is not fleetjax's")
+        _expect(_OWN_DIGEST in content, "it has no SHA-256 of its own (another version of fleetjax?)")
+        _expect(
+            content[_OWN_DIGEST] == with_digest(content)[_OWN_DIGEST], "it was edited or is damaged; its SHA-256 is another"
+        )
         seed, digests = content.get("seed"), content.get("sha256")
         if not isinstance(seed, int) or not 0 <= seed < 2**32:
             raise ValueError(f"seed = {seed!r} must be a whole number")

@@ -5,6 +5,7 @@ What cannot be used is refused with one line on stderr and exit code 2, before a
 
 import argparse
 import contextlib
+import io
 import os
 import sys
 import time
@@ -17,6 +18,7 @@ import numpy as np
 
 from fleetjax import envs
 from fleetjax.config import FIELDS, Config, make_config, validate
+from fleetjax.console.controls import CONTROLS
 from fleetjax.console.replaying import Disagreement
 from fleetjax.envs import get_defaults, list_envs
 from fleetjax.io import execution, export, files, flags, folder, operation, text
@@ -48,6 +50,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         "console": _console,
         "replay": _replay,
     }
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a name may hold characters that its encoding lacks
     try:
         arguments = flags.parse(sys.argv[1:] if argv is None else argv)
         commands[arguments.command](arguments)
@@ -82,7 +87,7 @@ def _run(arguments: argparse.Namespace) -> None:
             raise ValueError(f"checkpoint_every = {arguments.checkpoint_every} must be 0 (none) or at least 2 timesteps")
         run = _to_resume(arguments, overrides) if arguments.resume else _to_begin(arguments, overrides)
     if not arguments.resume:
-        folder.check_free(run.folder, overwrite=arguments.overwrite)
+        folder.check_folder(run.folder, overwrite=arguments.overwrite)
         run.folder.mkdir(parents=True, exist_ok=True)
     with files.lock(run.folder):
         _run_in(run, resume=bool(arguments.resume), checkpoint_every=arguments.checkpoint_every)
@@ -95,7 +100,9 @@ def _to_begin(arguments: argparse.Namespace, given: Mapping[str, Any]) -> folder
         ValueError: if the configuration cannot be used.
     """
     if "environment" not in given:
-        raise ValueError(f"ENV is missing; choose one of {', '.join(list_envs())}, or go on with a run by --resume RUN")
+        known = CONTROLS if arguments.command == "console" else list_envs()
+        resume = ", or resume a run with --resume RUN" if arguments.command == "run" else ""
+        raise ValueError(f"ENV is missing; choose one of {', '.join(known)}{resume}")
     overrides = {name: value for name, value in given.items() if name not in ("environment", "algorithm")}
     config, seed = make_config(given["environment"], given.get("algorithm", "cur"), **overrides), arguments.seed or 0
     return folder.Run(arguments.output or folder.default_folder(config, seed), config, seed, arguments.log_interventions)
@@ -110,7 +117,7 @@ def _to_resume(arguments: argparse.Namespace, given: Mapping[str, Any]) -> folde
     if arguments.output or arguments.overwrite:
         raise ValueError("--resume goes on in the run's own folder; leave out --output and --overwrite")
     run = folder.read_run(arguments.resume)
-    if (run.folder / folder.RECORD).exists():
+    if folder.RECORD in run.digests or (run.folder / folder.RECORD).exists():
         raise ValueError(
             f"{run.folder} was supervised by people, who are not there any more; only `fleetjax replay` repeats it"
         )
@@ -132,37 +139,13 @@ def _run_in(run: folder.Run, *, resume: bool, checkpoint_every: int) -> None:
     if metrics:
         say(f"{run.folder} is finished; there is nothing to go on with")
     else:
-        folder.write_config(run, sealed=False) if resume else folder.create(run)
-        metrics = _operate(run, resume=resume, checkpoint_every=checkpoint_every)
+        metrics = operation.operate(run, resume=resume, checkpoint_every=checkpoint_every, save=_save)
     _report(run, metrics, f"{text.duration(time.monotonic() - begun)} in all")
 
 
 def _report(run: folder.Run, metrics: Metrics, last: str) -> None:
     print(f"\n{text.headline(run.config, run.seed)}\n\n{text.run_table(metrics, run.config)}\n")
     print(f"{last}. Run folder: {run.folder}")
-
-
-def _operate(run: folder.Run, *, resume: bool, checkpoint_every: int) -> Metrics:
-    """Run what is left, and write what it gave."""
-    try:
-        metrics, state = operation.operate(run, resume=resume, checkpoint_every=checkpoint_every)
-    except (KeyboardInterrupt, operation.Diverged):
-        _keep(run)
-        raise
-    if get_algorithm(run.config.algorithm).pretrains:
-        folder.write_policy(run.folder, state.learner)
-    _save(run, metrics)
-    return metrics
-
-
-def _keep(run: folder.Run) -> None:
-    """Draw what an interrupted run has; remove its folder if that is nothing."""
-    path = run.folder / folder.METRICS
-    data = path.read_bytes() if path.exists() else b""
-    if data.count(b"\n") < 2:  # the head alone
-        folder.discard(run.folder)
-        raise KeyboardInterrupt("before the first timestep; nothing was kept") from None
-    _save(run, folder.parse_metrics(data, run.config.num_steps))
 
 
 def _save(run: folder.Run, metrics: Metrics) -> None:
@@ -198,7 +181,7 @@ def _plot(arguments: argparse.Namespace) -> None:
         figure.check_format(arguments.output)
         runs = [folder.read_run(path) for path in arguments.runs]
         data = [(run.config, run.seed, folder.read_metrics(run)) for run in runs]
-    folder.check_free(arguments.output, overwrite=arguments.overwrite)
+    output = folder.check_free(arguments.output, overwrite=arguments.overwrite)
     groups = figure.group(data)
     for run, (_, _, metrics) in zip(runs, data, strict=True):
         if len(metrics.successes) < run.config.num_steps:
@@ -207,7 +190,7 @@ def _plot(arguments: argparse.Namespace) -> None:
     if left_out:
         say(f"{text.plural(left_out, 'run')} left out: same settings and seed as a later one")
     drawn = figure.draw(groups)
-    files.write(arguments.output, figure.render(drawn, arguments.output.suffix))
+    files.write(output, figure.render(drawn, arguments.output.suffix))
     print(arguments.output)
 
 
@@ -219,8 +202,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
         if not get_algorithm(config.algorithm).pretrains:
             raise ValueError(f"algorithm = {config.algorithm!r} trains no policy that could be evaluated")
         learner = folder.read_policy(run)
-    output = run.folder / folder.EVALUATION
-    folder.check_free(output, overwrite=arguments.overwrite)
+    output = folder.check_free(run.folder / folder.EVALUATION, overwrite=arguments.overwrite)
     seed = (run.seed + 1) % 2**32 if arguments.seed is None else arguments.seed
     chunks: list[Metrics] = []
     say(f"{text.headline(config, seed)}, nobody teleoperates: compiling ...")
@@ -232,8 +214,8 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     metrics = execution.join(chunks)
     total = {name: np.sum(getattr(metrics, name)).item() for name in _EVALUATED}
     content = {"num_steps": config.num_steps, "seed": seed, "totals": total, "versions": folder.versions()}
+    print(text.evaluation_table(metrics, config), flush=True)  # the disk may have filled up meanwhile
     files.write_json(output, content)
-    print(text.evaluation_table(metrics, config))
 
 
 def _export(arguments: argparse.Namespace) -> None:
@@ -243,9 +225,9 @@ def _export(arguments: argparse.Namespace) -> None:
         found = folder.read_interventions(run)
     name = "robomimic.hdf5" if arguments.format == "robomimic" else arguments.format
     output = arguments.output or run.folder / name
-    folder.check_free(output, overwrite=arguments.overwrite)
+    target = folder.check_free(output, overwrite=arguments.overwrite, is_folder=arguments.format != "robomimic")
     with _refusing():
-        export.export(found, run.config, envs.make(run.config.environment, run.config.backend).spec, output, arguments.format)
+        export.export(found, run.config, envs.make(run.config.environment, run.config.backend).spec, target, arguments.format)
     steps = sum(map(len, found))
     say(f"{text.plural(len(found), 'intervention')}, {text.plural(steps, 'timestep')} of human actions")
     print(output)
@@ -270,7 +252,7 @@ def _render(arguments: argparse.Namespace) -> None:
             config = make_config(config.environment, "expert", **shown, backend=config.backend)
         learner = folder.read_policy(run) if run and policy == "robot" else None
         render.check(config)
-    folder.check_free(arguments.output, overwrite=arguments.overwrite)
+    output = folder.check_free(arguments.output, overwrite=arguments.overwrite)
     seed = arguments.seed if arguments.seed is not None else run.seed if run else 0
     key = jax.random.key(seed)
     say(f"{text.headline(config, seed)}, policy {policy}: running ...")
@@ -281,7 +263,7 @@ def _render(arguments: argparse.Namespace) -> None:
     pictures = render.draw(film, env.scene, width=arguments.width, every=arguments.every)
     rate = 1 / (env.spec.control_step * arguments.every)
     with _refusing():
-        files.write(arguments.output, render.encode(pictures, arguments.output, rate=rate))
+        files.write(output, render.encode(pictures, arguments.output, rate=rate))
     print(arguments.output)
 
 
@@ -296,7 +278,7 @@ def _console(arguments: argparse.Namespace) -> None:
             arguments.interval = envs.make(run.config.environment, run.config.backend).spec.control_step
         names = ("host", "port", "token", "interval", "timeout", "wait")
         command.check(run.config, **{name: getattr(arguments, name) for name in names})
-    folder.check_free(run.folder, overwrite=arguments.overwrite)
+    folder.check_folder(run.folder, overwrite=arguments.overwrite)
 
     from fleetjax.console import server
 
@@ -304,7 +286,7 @@ def _console(arguments: argparse.Namespace) -> None:
     with contextlib.closing(server.listen(arguments.host, arguments.port)) as listener:
         run.folder.mkdir(parents=True, exist_ok=True)
         with files.lock(run.folder):
-            metrics = command.supervise(run, options, listener, lambda metrics: _save(run, metrics))
+            metrics = command.supervise(run, options, listener, _save)
     _report(run, metrics, f"{text.plural(len(metrics.successes), 'timestep')} recorded")
 
 

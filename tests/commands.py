@@ -1,6 +1,9 @@
 """How tests look at what commands print and write."""
 
+import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +23,13 @@ TINY = [
 def contents(path: Path) -> dict[str, bytes]:
     """Return the files of a folder by name; those of its folders are left out."""
     return {file.name: file.read_bytes() for file in path.iterdir() if file.is_file()}
+
+
+def edit_config(path: Path, edit: Callable[[dict[str, Any]], Any]) -> None:
+    """Edit the content of a run folder's config.json, and seal it again, as a forger would."""
+    content = json.loads((path / folder.CONFIG).read_text())
+    edit(content)
+    (path / folder.CONFIG).write_text(json.dumps(folder.with_digest(content)))
 
 
 def refused(capsys, *arguments: object) -> str:

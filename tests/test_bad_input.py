@@ -29,7 +29,7 @@ BAD_RUNS = {
     "flag with =": ((*RUN, "--hard-reset=4"), "unknown flag --hard-reset; the closest is --hard-reset-time"),
     "too much": ((*RUN, "humanoid"), "unexpected argument 'humanoid'"),
     "no value": ((*RUN, "--num-robots"), "--num-robots: expected one argument"),
-    "no environment": (("run",), "ENV is missing"),
+    "no environment": (("run",), "navigation, or resume a run with --resume RUN\n"),
     "no goal": (("run", "humanoid", "--algorithm", "thrifty_dagger"), "algorithm = 'thrifty_dagger' needs a goal"),
     "negative uncertainty": ((*RUN, "--uncertainty-threshold", -0.1), "uncertainty_threshold = -0.1"),
     "negative risk": ((*RUN, "--risk-threshold", "-.5"), "risk_threshold = -0.5 must be in [0, 1]"),

@@ -1,5 +1,6 @@
 """The command line: what it prints and writes, and that its chunks change nothing."""
 
+import io
 import json
 import shutil
 import signal
@@ -15,7 +16,7 @@ from commands import STEPS, TINY, contents, refused
 
 import fleetjax
 from fleetjax import cli
-from fleetjax.io import folder
+from fleetjax.io import figure, folder, render
 
 
 @pytest.fixture(scope="module")
@@ -121,6 +122,72 @@ def test_evaluation_is_the_librarys(copied, capsys):
     assert json.loads((copied / "evaluation.json").read_text())["seed"] == 4  # not the training's 3
 
 
+def test_an_evaluation_is_shown_even_if_it_cannot_be_stored(copied, monkeypatch, capsys):
+    full = OSError(28, "No space left on device", "evaluation.json")
+    monkeypatch.setattr(cli.files, "write_json", lambda *arguments: (_ for _ in ()).throw(full))
+    assert cli.main(["evaluate", str(copied), "--num-steps", "16"]) == 2
+    printed = capsys.readouterr()
+    assert printed.out.splitlines()[-1].startswith("C.U.R. ")
+    assert printed.err.splitlines()[-1] == "fleetjax: evaluation.json: No space left on device"
+
+
+def test_an_output_that_is_a_link_counts_and_its_target_is_written(copied, tmp_path, capsys):
+    link, target = tmp_path / "link.svg", tmp_path / "elsewhere" / "figure.svg"
+    target.parent.mkdir()
+    link.symlink_to(target)
+    for _ in range(2):  # a dangling link, then one that leads to a file
+        assert f"{link} exists already" in refused(capsys, "plot", copied, "--output", link)
+        assert cli.main(["plot", str(copied), "--output", str(link), "--overwrite"]) == 0
+        assert capsys.readouterr().out == f"{link}\n"
+        assert link.readlink() == target
+        assert target.read_bytes().startswith(b"<?xml")
+
+
+def fail(*arguments, **options):
+    raise AssertionError("something was computed")
+
+
+def test_outputs_that_cannot_be_written_are_refused_before_anything_is_computed(copied, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(render, "start", fail)
+    monkeypatch.setattr(figure, "draw", fail)
+    monkeypatch.setattr(cli.execution, "start_evaluation", fail)
+    monkeypatch.setattr(folder, "read_interventions", lambda run: [])
+    monkeypatch.setattr(cli.export, "export", fail)
+    file = tmp_path / "file"
+    file.touch()
+    commands = {"png": ("plot", copied), "gif": ("render", "navigation"), "hdf5": ("export", copied, "--format", "robomimic")}
+    for suffix, command in commands.items():
+        taken = tmp_path / f"taken.{suffix}"
+        taken.mkdir()
+        places = {
+            tmp_path / "nowhere" / f"x.{suffix}": f"{tmp_path / 'nowhere'} does not exist",
+            file / f"x.{suffix}": f"{file} is not a folder",
+            Path(f"/proc/x.{suffix}"): f"/proc/x.{suffix} cannot be written: No such file or directory",
+            taken: f"{taken} is a folder",
+        }
+        for output, reason in places.items():
+            assert reason in refused(capsys, *command, "--output", output, "--overwrite")
+    assert f"{file} is a file" in refused(capsys, "export", copied, "--format", "minari", "--output", file, "--overwrite")
+    before = contents(copied)
+    read_only = OSError(30, "Read-only file system")
+    monkeypatch.setattr(cli.files.tempfile, "NamedTemporaryFile", lambda **options: (_ for _ in ()).throw(read_only))
+    said = refused(capsys, "evaluate", copied)
+    assert f"{copied / 'evaluation.json'} cannot be written: Read-only file system" in said
+    assert contents(copied) == before
+
+
+def test_characters_that_an_encoding_lacks_are_replaced(copied, tmp_path, monkeypatch):
+    path = copied.rename(tmp_path / "rün")
+    for name in ("stdout", "stderr"):
+        monkeypatch.setattr(sys, name, io.TextIOWrapper(io.BytesIO(), "ascii", write_through=True))
+    assert cli.main(["plot", str(path), "--output", str(path / "all.svg")]) == 0
+    assert cli.main(["plot", str(path), "--output", str(path / "all.svg")]) == 2
+    for stream, end in ((sys.stdout, b"r?n/all.svg"), (sys.stderr, b"replace it")):
+        shown = stream.buffer.getvalue()
+        assert b"r?n" in shown
+        assert shown.strip().endswith(end)
+
+
 RUN = ("run", "navigation")
 
 
@@ -131,7 +198,7 @@ def test_existing_folders_and_files_are_not_overwritten(copied, tmp_path, capsys
     file.write_text("precious")
     assert "exists already" in refused(capsys, *RUN, "--output", file)
     assert "exists already" in refused(capsys, "plot", copied, "--output", file)
-    assert "File exists" in refused(capsys, *RUN, "--output", file, "--overwrite")
+    assert "is not a run folder" in refused(capsys, *RUN, "--output", file, "--overwrite")
     assert file.read_text() == "precious"
     assert contents(copied) == before
 
@@ -197,8 +264,12 @@ def test_list_shows_environments_and_algorithms(capsys):
 def test_parameters_arrive_as_they_are_typed(monkeypatch, tmp_path):
     made = []
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(cli.folder, "create", lambda run: made.append((run.config, run.seed)))
-    monkeypatch.setattr(cli, "_operate", lambda *arguments, **options: (_ for _ in ()).throw(OSError("stop here")))
+
+    def operate(run, **options):
+        made.append((run.config, run.seed))
+        raise OSError("stop here")
+
+    monkeypatch.setattr(cli.operation, "operate", operate)
     flags = ["--hidden-sizes", "16", "8", "--no-normalize-observations", "--num-steps", "1e3", "--risk-threshold", ".25"]
     fleet = ["--algorithm", "expert", "--num-robots", "7", "--backend", "native"]
     assert cli.main(["run", "navigation", *fleet, "--seed", "4294967295", *flags]) == 2

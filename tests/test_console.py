@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from commands import contents, refused
+from commands import contents, edit_config, refused
 from consoles import SMALL, claim, compile_once, flags, hear, make_config, make_session, say
 from websockets.sync.client import connect
 
@@ -384,7 +384,7 @@ def test_beyond_this_machine_addresses_and_its_own_name_are_let_in_and_other_nam
         (["navigation", "--humans", "200"], "num_humans = 200"),
         (["navigation", "--fill", "robots"], "--fill"),
         (["navigation", "--checkpoint-every", "5"], "--checkpoint-every"),
-        ([], "ENV is missing"),
+        ([], "ENV is missing; choose one of navigation, block_push\n"),
     ],
 )
 def test_what_cannot_be_used_is_refused_in_one_line(arguments, reason, capsys, tmp_path, monkeypatch):
@@ -415,9 +415,12 @@ def test_a_port_in_use_and_a_folder_in_use_are_refused(capsys, tmp_path):
     assert not (tmp_path / "run").exists()
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "mine").write_text("precious")
-    assert "exists already" in refused(capsys, "console", "navigation", "--port", "0", "--output", tmp_path / "run")
+    console = ("console", "navigation", "--port", "0", "--output", tmp_path / "run")
+    assert "is not a run folder" in refused(capsys, *console, "--overwrite")
+    (tmp_path / "run" / "config.json").touch()
+    assert "exists already" in refused(capsys, *console)
     with files.lock(tmp_path / "run"):
-        said = refused(capsys, "console", "navigation", "--port", "0", "--overwrite", "--output", tmp_path / "run")
+        said = refused(capsys, *console, "--overwrite")
     assert "is in use by process" in said
 
 
@@ -530,9 +533,7 @@ def test_a_session_replays_to_the_bit_and_damage_is_refused(tmp_path, port_of, c
 def reseal(path, name: str, data: bytes) -> None:
     """Write a file with its digest, as a forger would."""
     (path / name).write_bytes(data)
-    content = json.loads((path / "config.json").read_text())
-    content["sha256"][name] = files.digest(data)
-    (path / "config.json").write_text(json.dumps(content))
+    edit_config(path, lambda content: content["sha256"].update({name: files.digest(data)}))
 
 
 def restore(path, original: dict[str, bytes]) -> None:
@@ -560,6 +561,23 @@ def test_ctrl_c_before_the_first_timestep_leaves_nothing(tmp_path, port_of, caps
     stopper.join()
     assert "nothing was kept" in capsys.readouterr().err
     assert not path.exists()
+
+
+def test_an_older_run_stays_until_the_first_timestep(tmp_path, monkeypatch, port_of, capsys):
+    path = tmp_path / "run"
+    path.mkdir()
+    older = {"config.json": b"{}", "metrics.csv": b"precious", "mine": b"mine"}
+    restore(path, older)
+    console = ["console", "navigation", *flags(num_steps=1), "--port", "0", "--output", str(path), "--overwrite"]
+    stopper = threading.Thread(target=lambda: (port_of(), knock(port_of()), os.kill(os.getpid(), signal.SIGINT)))
+    stopper.start()
+    assert cli.main(console) == 130
+    stopper.join()
+    assert f"before the first timestep; {path} is as it was" in capsys.readouterr().err
+    assert contents(path) == older
+    assert cli.main([*console, "--wait", "0"]) == 0
+    assert set(contents(path)) == {"config.json", "metrics.csv", "figure.png", "policy.msgpack", "console.bin", "mine"}
+    assert cli.main(["replay", str(path)]) == 0
 
 
 def knock(port: int) -> None:

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from commands import make_metrics
+from commands import edit_config, make_metrics
 from hypothesis import strategies
 
 import fleetjax
-from fleetjax.io import execution, files, folder
+from fleetjax.io import checkpoint, execution, files, folder
 from fleetjax.learning.imitation import make_learner
 from fleetjax.learning.networks import Normalizer
 from fleetjax.metrics import Metrics
@@ -78,7 +78,7 @@ def test_the_configuration_is_plain_json_with_seed_and_versions(saved):
     assert content["config"]["hidden_sizes"] == [8]
     assert content["config"]["normalize_observations"] is True
     assert content["seed"] == 5
-    assert set(content["versions"]) == {"fleetjax", "jax", "mujoco"}
+    assert content["versions"] == [{"timestep": 0, **folder.versions()}]
     assert not [path.name for path in saved.iterdir() if path.name.endswith(".partial")]
 
 
@@ -99,9 +99,13 @@ def flip(path: Path, place: int = -40) -> None:
 
 
 def change(path: Path, **fields) -> None:
-    content = json.loads(path.read_text())
-    content["config"] |= fields
-    path.write_text(json.dumps(content))
+    edit_config(path.parent, lambda content: content["config"].update(fields))
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    data = path.read_text()
+    assert old in data
+    path.write_text(data.replace(old, new))
 
 
 DAMAGES = {
@@ -116,7 +120,12 @@ DAMAGES = {
     "no text": (lambda run: (run / "config.json").write_bytes(b"\xff\xfe\x00"), "config.json cannot be used"),
     "deep JSON": (lambda run: (run / "config.json").write_text("[" * 200_000), "nested too deeply"),
     "a list": (lambda run: (run / "config.json").write_text("[1]"), "not fleetjax's"),
-    "a foreign file": (lambda run: (run / "config.json").write_text('{"config": {"lr": 1}}'), "seed = None"),
+    "a foreign file": (lambda run: (run / "config.json").write_text('{"config": {"lr": 1}}'), "no SHA-256 of its own"),
+    "sealed by others": (lambda run: edit_config(run, lambda content: content.pop("seed")), "seed = None"),
+    "other digests": (lambda run: edit_config(run, lambda content: content["sha256"].update(mine="")), "are those of others"),
+    "another robot": (lambda run: edit(run / "config.json", '"navigation"', '"humanoid"'), "it was edited or is damaged"),
+    "another version": (lambda run: edit(run / "config.json", '"mujoco": "', '"mujoco": "1'), "it was edited or is damaged"),
+    "sealed by hand": (lambda run: edit(run / "config.json", '"sha256_config": "', '"sha256_config": "0'), "it was edited"),
     "unknown field": (lambda run: change(run / "config.json", flux=1), "unknown fields: flux"),
     "wrong type": (lambda run: change(run / "config.json", num_robots="many"), "num_robots = 'many'"),
     "wrong list": (lambda run: change(run / "config.json", hidden_sizes=7), "hidden_sizes = 7"),
@@ -126,6 +135,48 @@ DAMAGES = {
     "other shapes": (lambda run: change(run / "config.json", hidden_sizes=[9]), "shapes"),
     "other layers": (lambda run: change(run / "config.json", hidden_sizes=[8, 8]), "policy.msgpack cannot be used"),
 }
+
+
+SINCE_0 = {"timestep": 0, "fleetjax": "1", "jax": "2", "mujoco": "3"}
+
+
+@pytest.mark.parametrize(
+    "versions",
+    [
+        None,
+        folder.versions(),
+        [],
+        [7],
+        [folder.versions()],
+        [SINCE_0 | {"jax": 7}],
+        [SINCE_0 | {"timestep": "0"}],
+        [SINCE_0 | {"timestep": 1}],
+        [SINCE_0 | {"timestep": -1}, SINCE_0],
+        [SINCE_0, SINCE_0],
+        [SINCE_0, SINCE_0 | {"timestep": 9}, SINCE_0 | {"timestep": 8}],
+    ],
+)
+def test_damaged_versions_are_refused(saved, versions):
+    edit_config(saved, lambda content: content.update(versions=versions))
+    with pytest.raises(ValueError, match="its versions are not"):
+        folder.read_run(saved)
+
+
+def test_versions_are_listed_from_the_timestep_on_from_which_they_ran(saved, monkeypatch):
+    run = folder.read_run(saved)
+    assert folder.resumed(run, 8) == run
+    entries = [{"timestep": 0, **folder.versions()}]
+    for timestep, jax_version in ((8, "a"), (12, "a"), (20, "b")):
+        monkeypatch.setattr(jax, "__version__", jax_version)
+        run = folder.resumed(run, timestep)
+        if timestep != 12:  # nothing has changed
+            entries.append({"timestep": timestep, **folder.versions()})
+        assert list(run.versions) == entries
+    folder.write_config(run, sealed=True)
+    assert folder.read_run(saved).versions == run.versions
+    assert list(folder.resumed(run, 20).versions) == entries
+    monkeypatch.setattr(jax, "__version__", "a")
+    assert list(folder.resumed(run, 20).versions) == entries[:2]
 
 
 def read_all(path: Path) -> None:
@@ -151,6 +202,7 @@ def test_damaged_and_foreign_folders_are_refused_with_the_reason(saved, name):
         ("\n7,", "\n7,7,", "metrics.csv cannot be used"),
         ("\n7,", "\n7,x", "metrics.csv cannot be used"),
         ("\n7,", "\n7,99999999999", "metrics.csv cannot be used"),
+        ("\n7,", f"\n7,{200_000 * '1'}", "metrics.csv cannot be used: field larger than field limit"),
     ],
 )
 def test_metrics_that_make_no_sense_are_refused_even_where_the_digest_fits(saved, config, old, new, reason):
@@ -179,13 +231,34 @@ def test_default_folders_are_new(tmp_path, monkeypatch, config):
 
 
 def test_overwriting_spares_what_fleetjax_did_not_write(saved, config):
+    checkpoints = saved / checkpoint.FOLDER
+    (checkpoints / "0000000007").mkdir(parents=True)
+    (checkpoints / "0000000007" / "data").write_text("a run's")
+    for name in ("0000000008", "kept-0000000007", "00000000070"):
+        path = checkpoints / name / "mine" if name != "0000000008" else checkpoints / name  # here a file
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("mine")
     (saved / "notes.txt").write_text("mine")
-    with pytest.raises(FileExistsError, match="--overwrite"):
-        folder.check_free(saved, overwrite=False)
-    folder.check_free(saved, overwrite=True)
     folder.create(folder.Run(saved, config, 6))
-    assert {path.name for path in saved.iterdir()} == {"config.json", "notes.txt"}
+    assert {path.name for path in saved.iterdir()} == {"config.json", "notes.txt", "checkpoints"}
+    assert {path.name for path in checkpoints.iterdir()} == {"0000000008", "kept-0000000007", "00000000070"}
     assert folder.read_run(saved).seed == 6
+
+
+def test_only_a_run_is_overwritten(saved, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("mine")
+    for path in (tmp_path / "mine", tmp_path / "mine" / "notes.txt"):
+        for overwrite in (False, True):
+            with pytest.raises(FileExistsError, match="exists already and is not a run folder"):
+                folder.check_folder(path, overwrite=overwrite)
+    with pytest.raises(FileExistsError, match="--overwrite"):
+        folder.check_folder(saved, overwrite=False)
+    (saved / "config.json").write_text("{")
+    folder.check_folder(saved, overwrite=True)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / files.LOCK).touch()  # as a kill may leave it
+    folder.check_folder(tmp_path / "empty", overwrite=False)
 
 
 @hypothesis.given(strategies.integers(1, 200_000), strategies.integers(2, 5_000) | strategies.none())

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import re
 import resource
 import shutil
 import signal
@@ -15,7 +16,7 @@ import h5py
 import jax
 import numpy as np
 import pytest
-from commands import STEPS, TINY, contents, refused
+from commands import STEPS, TINY, contents, edit_config, refused
 
 import fleetjax
 from fleetjax import cli
@@ -219,13 +220,88 @@ def test_a_checkpoint_that_cannot_be_used_is_named_and_the_older_one_taken(stopp
     assert_same(stopped, whole)
 
 
+EMPTY = {"size": 0, "sha256": files.digest(b"")}
+MANIFESTS = [
+    b"",
+    b"\xff\xfe",
+    b"[" * 200_000,
+    b'{"notes": ' * 200_000,
+    b"null",
+    b"7",
+    {"notes": 7},
+    {"notes": {}},
+    {"notes": {"metrics": 7}},
+    {"notes": {"metrics": {"size": "many"}}},
+    {"notes": {"metrics": {"size": -1, "sha256": None}}},
+    {"notes": {"metrics": {"size": 10**40, "sha256": []}}},
+    {"notes": {"metrics": EMPTY, "interventions": EMPTY}},
+    {"sha256": 7},
+    {"sha256": {"../../metrics.csv": 7}},
+    {"timestep": {}},
+    {"config": 7},
+]
+
+
+def test_every_malformed_manifest_is_passed_over_with_the_reason(stopped):
+    run, path = folder.read_run(stopped), newest(stopped)
+    intact = json.loads((path / checkpoint.MANIFEST).read_text())
+    shown: list[str] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(operation, "say", shown.append)
+        for manifest in MANIFESTS:
+            data = manifest if isinstance(manifest, bytes) else json.dumps(intact | manifest).encode()
+            (path / checkpoint.MANIFEST).write_bytes(data)
+            start = operation._resume(run, jax.random.key(3), 2)
+            assert int(start.state.timestep) == 60, data[:50]
+            reason, chosen = shown[-2:]
+            assert re.fullmatch(rf"left out {re.escape(str(path))}: [\w ,'.-]+", reason), reason
+            assert chosen.endswith("0000000060")
+
+
+def test_what_others_leave_among_the_checkpoints_stays_and_does_no_harm(stopped, whole):
+    (stopped / checkpoint.FOLDER / ".DS_Store").write_text("stray")
+    (stopped / checkpoint.FOLDER / "9999999999").write_text("stray")
+    (stopped / checkpoint.FOLDER / "mine").mkdir()
+    assert run_here("run", "--resume", stopped, "--checkpoint-every", 30) == 0
+    assert steps_of(stopped) == [66, 96]
+    names = {path.name for path in (stopped / checkpoint.FOLDER).iterdir()}
+    assert names == {".DS_Store", "9999999999", "mine", "0000000066", "0000000096"}
+    assert_same(stopped, whole)
+
+
+def test_other_versions_are_told_and_listed(stopped, whole, monkeypatch, capsys):
+    versions = folder.versions()
+    with monkeypatch.context() as patch:
+        patch.setattr(jax, "__version__", "0.0.1")
+        patch.setattr(operation, "progress", interrupt_after(4))
+        assert run_here("run", "--resume", stopped, "--checkpoint-every", 0) == 130
+        expected = f"before t = 66 this run used jax {versions['jax']}; it resumes with jax 0.0.1, so its numbers may not be "
+        assert f"\n{expected}an undisturbed run's\n" in capsys.readouterr().err
+    entries = [{"timestep": 0, **versions}, {"timestep": 66, **versions, "jax": "0.0.1"}]
+    assert list(folder.read_run(stopped).versions) == entries
+    assert steps_of(stopped) == [66, 74]
+    assert run_here("run", "--resume", stopped) == 0
+    assert "before t = 74 this run used jax 0.0.1; it resumes with jax" in capsys.readouterr().err
+    assert list(folder.read_run(stopped).versions) == [*entries, {"timestep": 74, **versions}]
+    assert_same(stopped, whole)
+
+
+def test_a_run_that_starts_again_begins_its_list_of_versions_anew(stopped, whole):
+    shutil.rmtree(stopped / checkpoint.FOLDER)
+    run = folder.read_run(stopped)
+    folder.write_config(run._replace(versions=({**run.versions[0], "jax": "0.0.1"},)), sealed=False)
+    assert run_here("run", "--resume", stopped) == 0
+    assert folder.read_run(stopped).versions == run.versions
+    assert_same(stopped, whole)
+
+
 def test_without_a_whole_checkpoint_nothing_is_touched(stopped, capsys):
     for path in (stopped / checkpoint.FOLDER).iterdir():
         flip(path)
-    metrics = (stopped / "metrics.csv").read_bytes()
+    before = everything(stopped)
     assert run_here("run", "--resume", stopped) == 2
     assert "has no checkpoint that could be used" in capsys.readouterr().err.splitlines()[-1]
-    assert (stopped / "metrics.csv").read_bytes() == metrics
+    assert everything(stopped) == before
     assert steps_of(stopped) == [60, 66]
 
 
@@ -285,9 +361,7 @@ def test_flags_that_contradict_the_run_are_refused(whole, capsys, arguments, rea
 def test_what_is_no_run_or_of_a_newer_version_is_refused(stopped, capsys, tmp_path):
     assert "is not a run folder: there is none" in refused(capsys, "run", "--resume", tmp_path / "nowhere")
     assert "ENV is missing" in refused(capsys, "run")
-    content = json.loads((stopped / "config.json").read_text())
-    content["config"]["flux"] = 1
-    (stopped / "config.json").write_text(json.dumps(content))
+    edit_config(stopped, lambda content: content["config"].update(flux=1))
     assert "unknown fields: flux (another version of fleetjax?)" in refused(capsys, "run", "--resume", stopped)
 
 
@@ -298,6 +372,100 @@ def test_a_folder_in_use_is_refused(stopped, whole, capsys):
     assert steps_of(stopped) == [60, 66]
     assert run_here("run", "--resume", stopped) == 0
     assert not (stopped / files.LOCK).exists()
+    assert_same(stopped, whole)
+
+
+def test_a_finished_run_that_lacks_a_file_is_not_called_finished(whole, tmp_path, capsys):
+    path = Path(shutil.copytree(whole, tmp_path / "copy"))
+    remedy = "repeat the run with --overwrite"
+    for name in RESULTS:
+        data = (path / name).read_bytes()
+        (path / name).unlink()
+        said = refused(capsys, "run", "--resume", path)
+        assert f"{path / name} is missing" in said
+        assert remedy in said
+        (path / name).write_bytes(data[:-1] + b"?")
+        said = refused(capsys, "run", "--resume", path)
+        assert f"{path / name} cannot be used: its SHA-256" in said
+        assert remedy in said
+        (path / name).write_bytes(data)
+    run = folder.read_run(path)
+    for name in ("policy.msgpack", "interventions.bin"):  # as if it had not been there when the run was sealed
+        data = (path / name).read_bytes()
+        (path / name).unlink()
+        folder.write_config(run, sealed=True)
+        assert f"{path / name} is missing" in refused(capsys, "run", "--resume", path)
+        (path / name).write_bytes(data)
+        said = refused(capsys, "run", "--resume", path)
+        assert f"{path / name} cannot be used: its SHA-256 is not in config.json" in said
+        assert remedy in said
+        folder.write_config(run, sealed=True)
+    assert run_here("run", "--resume", path) == 0
+    assert "is finished" in capsys.readouterr().err
+
+
+def everything(path: Path) -> dict[str, bytes]:
+    """Return the files of a folder, and of its folders, by path; a lock is none of them."""
+    found = [file for file in path.rglob("*") if file.is_file() and file.name != files.LOCK]
+    return {str(file.relative_to(path)): file.read_bytes() for file in found}
+
+
+OVERWRITE = ("run", "navigation", *TINY, "--seed", "4", "--overwrite", "--output")
+
+
+def test_a_run_that_cannot_begin_overwrites_nothing(stopped):
+    before = everything(stopped)
+    with contextlib.suppress(TypeError):  # if validation lets it pass, its shapes do not
+        assert run_here(*OVERWRITE, stopped, "--supervisor", "humanoid") == 2
+    assert everything(stopped) == before
+
+
+@pytest.mark.parametrize("where", ["start", "go_on"])
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_what_stops_a_run_before_its_first_chunk_overwrites_nothing(stopped, monkeypatch, capsys, where, error):
+    before, seen = everything(stopped), []
+
+    def stop(*arguments, **options):
+        seen.append(everything(stopped))  # what a kill would leave
+        raise error
+
+    monkeypatch.setattr(operation.execution, where, stop)
+    if error is RuntimeError:
+        with pytest.raises(RuntimeError):
+            run_here(*OVERWRITE, stopped)
+    else:
+        assert run_here(*OVERWRITE, stopped) == 130
+        assert f"interrupted before the first timestep; {stopped} is as it was" in capsys.readouterr().err
+    assert seen == [before]
+    assert everything(stopped) == before
+
+
+def test_an_older_run_goes_with_the_first_chunk_and_ctrl_c_in_it_still_spares_it(stopped, monkeypatch):
+    before, real = everything(stopped), operation.execution.go_on
+
+    def go_on(*arguments, **options):
+        for number, chunk in enumerate(real(*arguments, **options)):
+            assert (everything(stopped) == before) == (number == 0)
+            if interrupted:
+                signal.raise_signal(signal.SIGINT)
+            yield chunk
+
+    monkeypatch.setattr(operation.execution, "go_on", go_on)
+    for interrupted, code in ((True, 130), (False, 0)):
+        assert run_here(*OVERWRITE, stopped) == code
+        assert (everything(stopped) == before) == interrupted
+    assert folder.read_run(stopped).seed == 4
+    assert not (stopped / checkpoint.FOLDER).exists()
+    assert set(contents(stopped)) == {"config.json", "metrics.csv", "figure.png", "policy.msgpack"}
+
+
+def test_a_run_that_is_stopped_before_its_first_checkpoint_is_read_resumes_later(stopped, whole, monkeypatch):
+    before = everything(stopped)
+    with monkeypatch.context() as patch:
+        patch.setattr(operation.execution, "shapes", lambda *arguments: (_ for _ in ()).throw(KeyboardInterrupt))
+        assert run_here("run", "--resume", stopped) == 130
+    assert everything(stopped) == before
+    assert run_here("run", "--resume", stopped) == 0
     assert_same(stopped, whole)
 
 

@@ -13,7 +13,7 @@ from fleetjax import envs
 from fleetjax.config import Config
 from fleetjax.console import controls
 from fleetjax.io import folder, text
-from fleetjax.io.operation import Diverged
+from fleetjax.io.operation import Diverged, unbegun
 from fleetjax.io.progress import progress, say
 from fleetjax.metrics import Metrics
 
@@ -45,8 +45,10 @@ def check(config: Config, *, host: str, port: int, token: str | None, interval: 
         raise ValueError(f"wait = {wait} must be in [0, {config.num_humans}], the seats that there are")
 
 
-def supervise(run: folder.Run, options: "Options", listener: socket.socket, save: Callable[[Metrics], None]) -> Metrics:
-    """Run a console in a folder that is locked.
+def supervise(
+    run: folder.Run, options: "Options", listener: socket.socket, save: Callable[[folder.Run, Metrics], None]
+) -> Metrics:
+    """Run a console in a folder that is locked. An older run in it goes with the first timestep.
 
     Args:
         run: the run.
@@ -65,12 +67,12 @@ def supervise(run: folder.Run, options: "Options", listener: socket.socket, save
     from fleetjax.console.session import Session
 
     begun = time.monotonic()
+    new = folder.prepare(run)
     say(f"{text.headline(run.config, run.seed)}: compiling and preparing ...")
-    folder.create(run)
     try:
         session = Session(run)
     except KeyboardInterrupt:
-        raise _nothing_kept(run) from None
+        raise unbegun(run, new=new) from None
 
     def ready() -> None:
         address = server.address_of(listener, options)
@@ -82,17 +84,11 @@ def supervise(run: folder.Run, options: "Options", listener: socket.socket, save
                 asyncio.run(server.Console(session, options).run(listener, ready=ready, show=show))
         except (KeyboardInterrupt, Diverged):
             if not session.metrics:
-                raise _nothing_kept(run) from None
-            save(session.complete())
+                raise unbegun(run, new=new) from None
+            save(run, session.complete())
             raise
         if not session.metrics:
-            raise _nothing_kept(run)
+            raise unbegun(run, new=new)
         metrics = session.complete()
-        save(metrics)
+        save(run, metrics)
     return metrics
-
-
-def _nothing_kept(run: folder.Run) -> KeyboardInterrupt:
-    """Remove the folder of a session without timesteps; return what to raise."""
-    folder.discard(run.folder)
-    return KeyboardInterrupt("before the first timestep; nothing was kept")

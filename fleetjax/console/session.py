@@ -6,7 +6,7 @@ import numpy as np
 from fleetjax import envs
 from fleetjax.console import record
 from fleetjax.console.engine import Engine, Inputs, View
-from fleetjax.io import execution, folder, text
+from fleetjax.io import execution, files, folder, text
 from fleetjax.io.operation import Diverged
 from fleetjax.metrics import Metrics, first_divergence
 from fleetjax.priority import get_algorithm
@@ -37,7 +37,7 @@ class Session:
         self.curves = [self._heights()]
         self._rows = record.row_type(run.config, self.env.spec)
         self._view: View | None = None
-        self._record, self._table = record.open_record(run.folder), folder.open_metrics(run.folder)
+        self._logs: tuple[files.Log, ...] = ()  # the record and the metrics, once there is a timestep
 
     @property
     def over(self) -> bool:
@@ -50,7 +50,7 @@ class Session:
         return self._view
 
     def finish(self, inputs: Inputs) -> Metrics:
-        """Complete the timestep and write it down; return its Metrics[1].
+        """Complete the timestep and write it down; return its Metrics[1]. With the first, an older run in the folder goes.
 
         Raises:
             OSError: if it cannot be written.
@@ -59,8 +59,12 @@ class Session:
         assert self._view is not None
         view, self._view = self._view, None
         metrics = as_chunk(self.engine.advance(inputs))
-        record.append(self._record, view, inputs, self._rows)
-        folder.append_metrics(self._table, metrics, view.timestep)
+        if not self._logs:
+            folder.create(self.run)
+            self._logs = record.open_record(self.run.folder), folder.open_metrics(self.run.folder)
+        log, table = self._logs
+        record.append(log, view, inputs, self._rows)
+        folder.append_metrics(table, metrics, view.timestep)
         self.metrics.append(metrics)
         self._total = {name: self._total[name] + more for name, more in text.add_up(metrics).items()}
         self.curves.append(self._heights())
@@ -75,7 +79,7 @@ class Session:
 
     def complete(self) -> Metrics:
         """Put what was written on the disk, and the policy beside it; return the Metrics[t]."""
-        for log in (self._record, self._table):
+        for log in self._logs:
             log.mark()
         if get_algorithm(self.config.algorithm).pretrains:
             folder.write_policy(self.run.folder, self.engine.state.learner)
@@ -83,7 +87,7 @@ class Session:
 
     def close(self) -> None:
         """Close the files."""
-        for log in (self._record, self._table):
+        for log in self._logs:
             log.close()
 
 

@@ -83,15 +83,28 @@ class Writer:
         except Exception as error:  # orbax passes on what its storage raises, of any kind
             shutil.rmtree(path, ignore_errors=True)
             raise OSError(f"the checkpoint at t = {timestep} could not be written ({files.one_line(error)})") from error
-        found = sorted(self.folder.iterdir())
+        found = _found(self.folder)
         kept = [whole for whole in found if (whole / MANIFEST).exists()][-KEPT:]
         for other in found:
             if other not in kept:
                 shutil.rmtree(other)
 
 
+def clear(folder: Path) -> None:
+    """Remove the checkpoints of a run; what others left among them stays."""
+    for path in _found(folder / FOLDER):
+        shutil.rmtree(path)
+    with contextlib.suppress(OSError):  # there is no such folder, or it holds files of others
+        (folder / FOLDER).rmdir()
+
+
+def _found(folder: Path) -> list[Path]:
+    """Return the checkpoints in a folder, finished or not, oldest first; what others left there is none."""
+    return sorted(path for path in folder.glob("[0-9]" * 10) if path.is_dir() and not path.is_symlink())
+
+
 def restore(
-    folder: Path, identity: Mapping[str, Any], shapes: FleetState, check: Callable[[Mapping[str, Any]], Any]
+    folder: Path, identity: Mapping[str, Any], shapes: FleetState, check: Callable[[Checkpoint], Any]
 ) -> tuple[Checkpoint | None, list[str]]:
     """Read the newest checkpoint of a run that is whole.
 
@@ -99,18 +112,18 @@ def restore(
         folder: folder of the run.
         identity: the run's.
         shapes: the structure of its state, by `jax.eval_shape`.
-        check: raises ValueError for notes that do not fit the run's other files.
+        check: raises ValueError for a checkpoint that does not fit the run's other files.
 
     Returns:
         The checkpoint, None if there is none, and for each newer one why it cannot be used.
     """
     refused = []
-    for path in sorted((folder / FOLDER).glob("[0-9]*"), reverse=True):
+    for path in reversed(_found(folder / FOLDER)):
         try:
             checkpoint = _read(path, identity, shapes)
-            check(checkpoint.notes)
+            check(checkpoint)
             return checkpoint, refused
-        except (ValueError, TypeError, KeyError, OSError) as error:
+        except Exception as error:  # whatever damage makes orbax raise, an older one may be intact
             refused.append(f"{path}: {files.one_line(error)}")
     return None, refused
 
@@ -123,7 +136,10 @@ def _read(path: Path, identity: Mapping[str, Any], shapes: FleetState) -> Checkp
     """
     if not (path / MANIFEST).exists():
         raise ValueError("it was never finished")
-    manifest = json.loads((path / MANIFEST).read_bytes())
+    try:
+        manifest = json.loads((path / MANIFEST).read_bytes())
+    except (ValueError, RecursionError):
+        raise ValueError(f"{MANIFEST} is damaged") from None
     if not isinstance(manifest, dict) or not isinstance(manifest.get("notes"), dict):
         raise ValueError(f"{MANIFEST} is not fleetjax's")
     if any(manifest.get(name) != value for name, value in identity.items()):

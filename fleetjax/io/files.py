@@ -5,6 +5,7 @@ import fcntl
 import hashlib
 import json
 import os
+import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,22 @@ def write(path: Path, data: bytes) -> None:
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def check_place(path: Path) -> None:
+    """Check that a file can be written, by writing another beside it: permissions alone do not tell.
+
+    Raises:
+        OSError: if it cannot.
+    """
+    if not path.parent.is_dir():
+        problem = "is not a folder" if path.parent.exists() else "does not exist"
+        raise OSError(f"{path} cannot be written: {path.parent} {problem}")
+    try:
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}."):
+            pass
+    except OSError as error:
+        raise OSError(f"{path} cannot be written: {error.strerror}") from None
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -115,17 +132,19 @@ class Log:
             self._file.close()
 
 
-def beginning(path: Path, mark: Mapping[str, Any]) -> bytes:
+def beginning(path: Path, mark: Any) -> bytes:
     """Return what a file held when it was marked.
 
     Raises:
         ValueError: if it does not hold it any more.
     """
-    size, wanted = mark.get("size"), mark.get("sha256")
-    if not path.is_file() or not isinstance(size, int):
+    size = mark.get("size") if isinstance(mark, Mapping) else None
+    if not isinstance(size, int):
+        raise ValueError(f"{path.name} is not noted there")
+    if not path.is_file():
         raise ValueError(f"{path.name} is missing")
     with path.open("rb") as file:
-        data = file.read(size)
-    if digest(data) != wanted:
+        data = file.read(min(size, path.stat().st_size))
+    if digest(data) != mark.get("sha256"):
         raise ValueError(f"{path.name} is not as it was at that time")
     return data

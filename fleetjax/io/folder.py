@@ -1,7 +1,7 @@
 """The folder of a run: configuration, per-timestep metrics, figure and trained policy.
 
-`config.json` is written when a run begins, and again last of all with the SHA-256 of the data files, which
-are refused if they do not match. Nothing is executed when it is read.
+`config.json` is written when a run begins, and again last of all with the SHA-256 of the data files, and always with
+that of its own content. What does not match is refused. Nothing is executed when it is read.
 """
 
 import contextlib
@@ -10,8 +10,8 @@ import io
 import itertools
 import json
 import math
+import os
 import re
-import shutil
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -36,6 +36,7 @@ RECORD = "console.bin"  # what people did, where they supervised the run
 DATA = (METRICS, POLICY, interventions.FILE, RECORD)
 REALS = ("reward", "uncertainty", "policy_loss")  # the metrics that are no counts
 _COLUMNS = ("timestep", *Metrics._fields)
+_OWN_DIGEST = "sha256_config"
 _LARGEST = 2**31 - 1  # traced integers are i32
 
 
@@ -48,6 +49,7 @@ class Run(NamedTuple):
         seed: the seed of its key.
         logged: whether interventions are logged.
         digests: SHA-256 by file name.
+        versions: what it ran under, in order, each with the `timestep` from which on; nothing before it begins.
     """
 
     folder: Path
@@ -55,6 +57,7 @@ class Run(NamedTuple):
     seed: int
     logged: bool = False
     digests: Mapping[str, str] = {}
+    versions: tuple[Mapping[str, Any], ...] = ()
 
 
 def default_folder(config: Config, seed: int) -> Path:
@@ -65,23 +68,67 @@ def default_folder(config: Config, seed: int) -> Path:
     return next(p for p in itertools.chain([path], others) if not p.exists())
 
 
-def check_free(path: Path, *, overwrite: bool) -> None:
-    """Check that a folder or file can be written without loss.
+def check_free(path: Path, *, overwrite: bool, is_folder: bool = False) -> Path:
+    """Check that an output can be written without loss, before it is computed.
+
+    Args:
+        path: where it shall go.
+        overwrite: whether it may replace what is there.
+        is_folder: whether it is a folder; else it is a file.
+
+    Returns:
+        Path: where to write it: in place of a link, its target.
 
     Raises:
         FileExistsError: if something is there, and it is no empty folder, unless `overwrite`.
+        OSError: if it cannot be written there.
     """
-    if not path.exists() or overwrite or (path.is_dir() and not any(path.iterdir())):
+    if os.path.lexists(path) and not overwrite and not (is_folder and path.is_dir() and not any(path.iterdir())):
+        raise FileExistsError(f"{path} exists already; pass --overwrite to replace it")
+    if path.exists() and path.is_dir() != is_folder:
+        raise FileExistsError(f"{path} is a {'file' if path.is_file() else 'folder'}; choose another --output")
+    target = Path(os.path.realpath(path))
+    files.check_place(target)
+    return target
+
+
+def is_run(path: Path) -> bool:
+    """Return whether a folder holds a run, be it damaged."""
+    return (path / CONFIG).exists()
+
+
+def check_folder(path: Path, *, overwrite: bool) -> None:
+    """Check that a run can be written to a folder without loss of anything but an older run.
+
+    Raises:
+        FileExistsError: if something is there that is neither an empty folder nor, with `overwrite`, a run.
+    """
+    if not os.path.lexists(path) or (path.is_dir() and {found.name for found in path.iterdir()} <= {files.LOCK}):
         return
-    raise FileExistsError(f"{path} exists already; choose another --output, or pass --overwrite")
+    if not is_run(path):
+        raise FileExistsError(f"{path} exists already and is not a run folder; choose another --output")
+    if not overwrite:
+        raise FileExistsError(f"{path} exists already; choose another --output, or pass --overwrite")
+
+
+def prepare(run: Run) -> bool:
+    """Write the configuration of a new run, unless the folder holds a run: that one stays until `create`.
+
+    Returns:
+        bool: whether the folder held no run.
+    """
+    new = not is_run(run.folder)
+    if new:
+        write_config(run, sealed=False)
+    return new
 
 
 def create(run: Run) -> None:
     """Write the configuration of a new run; an older run in the folder goes."""
-    for name in (CONFIG, FIGURE, EVALUATION, *DATA):
+    checkpoint.clear(run.folder)
+    write_config(run, sealed=False)  # before data go: if killed in between, this run can be resumed, from the start
+    for name in (FIGURE, EVALUATION, *DATA):
         (run.folder / name).unlink(missing_ok=True)
-    shutil.rmtree(run.folder / checkpoint.FOLDER, ignore_errors=True)
-    write_config(run, sealed=False)
 
 
 def discard(path: Path) -> None:
@@ -99,12 +146,31 @@ def versions() -> dict[str, str]:
     return {"fleetjax": VERSION, "jax": jax.__version__, "mujoco": mujoco.__version__}
 
 
+def resumed(run: Run, timestep: int) -> Run:
+    """Return a run as it resumes at a timestep: with today's versions from there on, if they are not those before."""
+    before = [entry for entry in run.versions if entry["timestep"] < timestep]
+    now = {"timestep": timestep, **versions()}
+    return run._replace(versions=(*before, *([now] if changes(before[-1], now) else [])))
+
+
+def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Return the names of what has another version now."""
+    return [name for name in versions() if before[name] != now[name]]
+
+
 def write_config(run: Run, *, sealed: bool) -> None:
     """Write `config.json`: every field, the seed, versions, and the SHA-256 of the data files that are there, if `sealed`."""
     data = {name: run.folder / name for name in DATA}
     digests = {name: files.digest(path.read_bytes()) for name, path in data.items() if sealed and path.exists()}
-    content = {"log_interventions": run.logged, "versions": versions(), "sha256": digests}
-    files.write_json(run.folder / CONFIG, identity(run.config, run.seed) | content)
+    ran_under = run.versions or [{"timestep": 0, **versions()}]
+    content = {"log_interventions": run.logged, "versions": ran_under, "sha256": digests}
+    files.write_json(run.folder / CONFIG, with_digest(identity(run.config, run.seed) | content))
+
+
+def with_digest(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of `config.json` with the SHA-256 of all else in it."""
+    rest = {name: value for name, value in content.items() if name != _OWN_DIGEST}
+    return rest | {_OWN_DIGEST: files.digest(json.dumps(rest, sort_keys=True).encode())}
 
 
 def to_plain(config: Config) -> dict[str, Any]:
@@ -158,7 +224,7 @@ def _blame(path: Path) -> Iterator[None]:
         raise ValueError(f"{path} is missing: not the folder of a finished run") from None
     except RecursionError:
         raise ValueError(f"{path} is damaged: nested too deeply") from None
-    except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, csv.Error) as error:
         raise ValueError(f"{path} cannot be used: {error}") from None
 
 
@@ -173,27 +239,40 @@ def read_run(folder: Path) -> Run:
     with _blame(folder / CONFIG):
         content = json.loads((folder / CONFIG).read_bytes())
         _expect(isinstance(content, dict) and isinstance(content.get("config"), dict), "it is not fleetjax's")
+        _expect(_OWN_DIGEST in content, "it has no SHA-256 of its own (another version of fleetjax?)")
+        _expect(
+            content[_OWN_DIGEST] == with_digest(content)[_OWN_DIGEST], "it was edited or is damaged; its SHA-256 is another"
+        )
         seed, digests = content.get("seed"), content.get("sha256")
         if not isinstance(seed, int) or not 0 <= seed < 2**32:
             raise ValueError(f"seed = {seed!r} must be a whole number")
-        if not isinstance(digests, dict):
-            raise ValueError("the SHA-256 of the data files are missing")
-        return Run(folder, _from_plain(content["config"]), seed, content.get("log_interventions") is True, digests)
+        if not isinstance(digests, dict) or not digests.keys() <= set(DATA):
+            raise ValueError("the SHA-256 of the data files are missing, or are those of others")
+        logged, ran_under = content.get("log_interventions") is True, _versions_from(content.get("versions"))
+        return Run(folder, _from_plain(content["config"]), seed, logged, digests, ran_under)
 
 
 def read_finished(run: Run) -> Metrics | None:
-    """Read the metrics of a run that has all its timesteps, and the policy that it was to train; None if it has not.
+    """Read the metrics of a run that has all its timesteps; None if it has not.
 
     Raises:
-        ValueError: if what it has is damaged.
+        ValueError: if anything that such a run leaves is missing or damaged.
     """
     if METRICS not in run.digests:
         return None
-    metrics = read_metrics(run)
-    if len(metrics.successes) < run.config.num_steps:
-        return None
-    if get_algorithm(run.config.algorithm).pretrains:
-        read_policy(run)
+    try:
+        metrics = read_metrics(run)
+        if len(metrics.successes) < run.config.num_steps:
+            return None
+        for name in run.digests:
+            with _blame(run.folder / name):
+                _read_data(run, name)
+        if get_algorithm(run.config.algorithm).pretrains:
+            read_policy(run)
+        if run.logged:
+            read_interventions(run)
+    except ValueError as error:
+        raise ValueError(f"{error}; repeat the run with --overwrite") from None
     return metrics
 
 
@@ -205,6 +284,21 @@ def _from_plain(fields: Mapping[str, Any]) -> Config:
     config = Config().replace(**fields)
     validate(config)
     return config
+
+
+def _versions_from(entries: Any) -> tuple[Mapping[str, Any], ...]:
+    """Return the versions that a run ran under.
+
+    Raises:
+        ValueError: if they are not such a list, in order from t = 0 on.
+    """
+    kinds = {"timestep": int, **dict.fromkeys(versions(), str)}
+    sound = isinstance(entries, list) and all(isinstance(entry, dict) and entry.keys() == kinds.keys() for entry in entries)
+    if sound and all(_fits(entry[name], kind) for entry in entries for name, kind in kinds.items()):
+        timesteps = [entry["timestep"] for entry in entries]
+        if timesteps[:1] == [0] and timesteps == sorted(set(timesteps)):
+            return tuple(entries)
+    raise ValueError("its versions are not a list of those that it ran under, from t = 0 on")
 
 
 def _expect(holds: bool, otherwise: str) -> None:
@@ -227,6 +321,8 @@ def _fits(value: Any, kind: type) -> bool:
 def _read_data(run: Run, name: str) -> bytes:
     """Return the content of a data file that is as it was written."""
     data = (run.folder / name).read_bytes()
+    if METRICS in run.digests:
+        _expect(name in run.digests, "its SHA-256 is not in config.json, so it may be another run's")
     _expect(name in run.digests, f"the run is not finished; go on with it: fleetjax run --resume {run.folder}")
     _expect(run.digests.get(name) == files.digest(data), "its SHA-256 is not that in config.json, so it is damaged")
     return data
@@ -248,6 +344,7 @@ def parse_metrics(data: bytes, num_steps: int) -> Metrics:
     Raises:
         ValueError: if it is not a run's of at most `num_steps` timesteps.
     """
+    _expect(bool(data), "it is empty")
     head, *rows = csv.reader(io.StringIO(data.decode()))
     _expect(head == list(_COLUMNS), "its columns are not those of this version of fleetjax")
     _expect(0 < len(rows) <= num_steps, f"{len(rows)} rows for {num_steps} timesteps")

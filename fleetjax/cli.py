@@ -17,7 +17,8 @@ import jax
 import numpy as np
 
 from fleetjax import envs
-from fleetjax.config import FIELDS, Config, make_config, validate
+from fleetjax.checks import check_run
+from fleetjax.config import FIELDS, Config, make_config
 from fleetjax.console.controls import CONTROLS
 from fleetjax.console.replaying import Disagreement
 from fleetjax.envs import get_defaults, list_envs
@@ -105,6 +106,7 @@ def _to_begin(arguments: argparse.Namespace, given: Mapping[str, Any]) -> folder
         raise ValueError(f"ENV is missing; choose one of {', '.join(known)}{resume}")
     overrides = {name: value for name, value in given.items() if name not in ("environment", "algorithm")}
     config, seed = make_config(given["environment"], given.get("algorithm", "cur"), **overrides), arguments.seed or 0
+    check_run(config)
     return folder.Run(arguments.output or folder.default_folder(config, seed), config, seed, arguments.log_interventions)
 
 
@@ -198,7 +200,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     with _refusing():
         run = folder.read_run(arguments.run)
         config = run.config.replace(num_steps=arguments.num_steps)
-        validate(config)
+        check_run(config)
         if not get_algorithm(config.algorithm).pretrains:
             raise ValueError(f"algorithm = {config.algorithm!r} trains no policy that could be evaluated")
         learner = folder.read_policy(run)
@@ -256,6 +258,7 @@ def _render(arguments: argparse.Namespace) -> None:
     seed = arguments.seed if arguments.seed is not None else run.seed if run else 0
     key = jax.random.key(seed)
     say(f"{text.headline(config, seed)}, policy {policy}: running ...")
+    config = config.replace(num_steps=arguments.skip + arguments.num_steps)  # whose human data there is room for
     config, state = render.start(config, key, learner, skip=arguments.skip)
     film = render.shoot(config.replace(num_steps=arguments.num_steps), key, state, num_shown=arguments.num_shown)
     say("drawing ...")

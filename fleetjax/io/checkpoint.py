@@ -98,6 +98,11 @@ def clear(folder: Path) -> None:
         (folder / FOLDER).rmdir()
 
 
+def is_any_finished(folder: Path) -> bool:
+    """Return whether a run has a checkpoint that was finished, be it damaged since."""
+    return any((path / MANIFEST).exists() for path in _found(folder / FOLDER))
+
+
 def _found(folder: Path) -> list[Path]:
     """Return the checkpoints in a folder, finished or not, oldest first; what others left there is none."""
     return sorted(path for path in folder.glob("[0-9]" * 10) if path.is_dir() and not path.is_symlink())

@@ -23,10 +23,10 @@ import numpy as np
 from flax import serialization
 
 from fleetjax import envs
+from fleetjax.checks import state_shapes
 from fleetjax.config import FIELDS, Config, validate
 from fleetjax.io import checkpoint, files, interventions
-from fleetjax.learning.imitation import LearnerState, make_learner
-from fleetjax.learning.networks import Normalizer
+from fleetjax.learning.imitation import LearnerState
 from fleetjax.metrics import Metrics
 from fleetjax.priority import get_algorithm
 from fleetjax.version import VERSION
@@ -373,11 +373,7 @@ def read_policy(run: Run) -> LearnerState:
         ValueError: if the file is missing, damaged or does not fit the configuration.
     """
     with _blame(run.folder / POLICY):
-        spec = envs.make(run.config.environment, run.config.backend).spec
-        entries = jnp.zeros(spec.observation_size)
-        shapes = jax.eval_shape(
-            make_learner(run.config, spec).init, jax.random.key(0), Normalizer(entries, entries, entries[0])
-        )
+        shapes = state_shapes(run.config, envs.make(run.config.environment, run.config.backend)).learner
         template = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
         stored = serialization.from_bytes(_policy(template), _read_data(run, POLICY))
         wanted, found = jax.tree.leaves(_policy(template)), jax.tree.leaves(stored)

@@ -213,7 +213,7 @@ def _resume(run: folder.Run, key: jax.Array, length: int) -> Start:
     for reason in refused:
         say(f"left out {reason}")
     if found is None:
-        if refused:
+        if checkpoint.is_any_finished(run.folder):
             raise Unusable(f"{run.folder} has no checkpoint that could be used; run it anew, with --overwrite")
         say("no checkpoint was written yet; from the start")
         return _begin(run, key, length)

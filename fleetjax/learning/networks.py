@@ -93,7 +93,7 @@ class Normalizer(NamedTuple):
     Attributes:
         mean: f32[O].
         deviation: f32[O].
-        limit: f32[] deviations from the mean beyond which observations are clipped; infinite for the identity.
+        limit: f32[] deviations from the mean beyond which observations are clipped; the largest f32 for the identity.
     """
 
     mean: jax.Array
@@ -119,5 +119,5 @@ def fit_normalizer(obs: jax.Array, size: jax.Array, *, enabled: jax.Array | bool
     mean = jnp.sum(weight * obs, axis=0)
     deviation = jnp.sqrt(jnp.sum(weight * (obs - mean) ** 2, axis=0))
     deviation = jnp.where(deviation < 1e-6, 1.0, deviation)
-    fitted, identity = (mean, deviation, CLIP), (0.0, 1.0, jnp.inf)
+    fitted, identity = (mean, deviation, CLIP), (0.0, 1.0, jnp.finfo(jnp.float32).max)
     return Normalizer(*(jnp.where(enabled, a, b).astype(jnp.float32) for a, b in zip(fitted, identity, strict=True)))

@@ -227,9 +227,9 @@ def _export(arguments: argparse.Namespace) -> None:
         found = folder.read_interventions(run)
     name = "robomimic.hdf5" if arguments.format == "robomimic" else arguments.format
     output = arguments.output or run.folder / name
-    target = folder.check_free(output, overwrite=arguments.overwrite, is_folder=arguments.format != "robomimic")
+    folder.check_free(output, overwrite=arguments.overwrite, is_folder=arguments.format != "robomimic")
     with _refusing():
-        export.export(found, run.config, envs.make(run.config.environment, run.config.backend).spec, target, arguments.format)
+        export.export(found, run.config, envs.make(run.config.environment, run.config.backend).spec, output, arguments.format)
     steps = sum(map(len, found))
     say(f"{text.plural(len(found), 'intervention')}, {text.plural(steps, 'timestep')} of human actions")
     print(output)

@@ -78,7 +78,7 @@ def test_the_classifier_agrees_with_the_teacher(outcome):
     env, config, result = outcome
     cells = itertools.product(range(toy_envs.BOARD), repeat=4)
     physics = jnp.array([cell for cell in cells if cell[:2] != cell[2:]])
-    states = jax.vmap(lambda p: begin(p, p * (2 / (toy_envs.BOARD - 1)) - 1))(physics)
+    states = jax.vmap(lambda p: begin(p, p.astype(jnp.float32) * (2 / (toy_envs.BOARD - 1)) - 1))(physics)
     robot = imitation.make_learner(config, env.spec).predict(result.state.learner, states.obs)[0]
     teacher = jax.vmap(toy_envs.teach_grid)(states)
     assert float(jnp.mean(jnp.argmax(robot, axis=1) == jnp.argmax(teacher, axis=1))) > 0.85

@@ -16,6 +16,13 @@ from fleetjax.envs import allegro_hand, anymal
 from fleetjax.supervisors import expert
 
 
+@pytest.fixture(autouse=True)
+def standard_promotion():
+    """Let brax mix types."""
+    with jax.numpy_dtype_promotion("standard"):
+        yield
+
+
 def trained(name):
     """Return a training, brax's networks, and parameters in which every number matters."""
     training = TRAININGS[name]

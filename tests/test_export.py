@@ -445,7 +445,8 @@ def test_what_no_export_of_the_format_wrote_is_not_overwritten(kind, run, tmp_pa
         assert tree(tmp_path) == before
     assert link.is_symlink()
     exported(run, kind, tmp_path / kind)
-    exported(run, kind, empty)
+    if kind != "robomimic":  # a file
+        exported(run, kind, empty)
 
 
 @pytest.mark.parametrize("kind", ["lerobot", "minari"])

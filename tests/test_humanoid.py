@@ -39,12 +39,8 @@ def body(
 ):
     """Return a state of the body; angles and speeds are those of the joints."""
     return physics.initial._replace(
-        qpos=jnp.concatenate([jnp.array(position), jnp.array(turn), jnp.broadcast_to(jnp.asarray(angles), 21)]).astype(
-            jnp.float32
-        ),
-        qvel=jnp.concatenate([jnp.array(velocity), jnp.array(spin), jnp.broadcast_to(jnp.asarray(speeds), 21)]).astype(
-            jnp.float32
-        ),
+        qpos=jnp.asarray(np.concatenate([position, turn, np.broadcast_to(angles, 21)]), jnp.float32),
+        qvel=jnp.asarray(np.concatenate([velocity, spin, np.broadcast_to(speeds, 21)]), jnp.float32),
         sensors=jnp.broadcast_to(jnp.asarray(sensors, jnp.float32), 12),
     )
 

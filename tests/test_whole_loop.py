@@ -47,7 +47,7 @@ def tiny():
 
 @pytest.fixture(scope="module")
 def run():
-    return compiled(fleetjax.run)
+    return compiled(lambda config, key: fleetjax.run(config, key))  # of its own: programs of one function share their cache
 
 
 def test_no_traced_field_recompiles(tiny, run):

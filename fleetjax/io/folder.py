@@ -281,7 +281,9 @@ def _from_plain(fields: Mapping[str, Any]) -> Config:
         _expect(not names, f"{problem} fields: {', '.join(sorted(names))} (another version of fleetjax?)")
     for name, value in fields.items():
         _expect(_fits(value, FIELDS[name].kind), f"{name} = {value!r} must be of type {FIELDS[name].kind.__name__}")
-    config = Config().replace(**fields)
+    config = Config().replace(**fields | {"human_capacity": 0})
+    if fields["human_capacity"] not in (0, config.human_capacity):  # it was asked for, and does not follow from the others
+        config = config.replace(human_capacity=fields["human_capacity"])
     validate(config)
     return config
 

@@ -23,7 +23,8 @@ def make_step(model: mujoco.MjModel, substeps: int) -> Callable[[PhysicsState, j
         data = template.replace(
             qpos=state.qpos, qvel=state.qvel, act=state.act, qacc_warmstart=state.warmstart, time=state.time, ctrl=control
         )
-        data = jax.lax.fori_loop(0, substeps, lambda _, d: mjx.step(device_model, d), data)
+        with jax.numpy_dtype_promotion("standard"):  # MJX mixes types
+            data = jax.lax.fori_loop(0, substeps, lambda _, d: mjx.step(device_model, d), data)
         after = PhysicsState(data.qpos, data.qvel, data.act, data.qacc_warmstart, data.sensordata, data.time, state.diverged)
         after = contain_divergence(state, after, failed=jnp.zeros((), bool))
         return jax.tree.map(lambda old, new: jnp.where(active, new, old), state, after)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 
 import fleetjax
 from fleetjax.config import Config
+from fleetjax.fleet import make_parts
 from fleetjax.learning import imitation, pretraining
 
 ROBOTS = ("humanoid", "anymal", "allegro_hand")  # whose observations end with the last action
@@ -28,19 +29,19 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     capacity = max(args.fresh, *args.demonstrations)
-    default = fleetjax.make_config(args.robot, "constraint", extra_demonstrations=0, human_capacity=capacity)
+    default = fleetjax.make_config(args.robot, "constraint_trained", extra_demonstrations=0, human_capacity=capacity)
     if args.gradient_steps is not None:
         default = default.replace(pretraining_steps=args.gradient_steps)
     env = fleetjax.envs.make(args.robot, default.backend)
-    learner = imitation.make_learner(default, env.spec)
+    parts = make_parts(default, env)
 
     @jax.jit
     def clone(config: Config, key: jax.Array):
-        return pretraining.pretrain(config, env, key)[:2]
+        return pretraining.pretrain(config, env, parts.learner, parts.supervisor, key)
 
     @jax.jit
-    def judge(policy: imitation.LearnerState, pairs: imitation.Pair, size: jax.Array) -> tuple[jax.Array, jax.Array]:
-        action, uncertainty = learner.predict(policy, pairs.obs)
+    def judge(policy: imitation.PolicyState, pairs: imitation.Pair, size: jax.Array) -> tuple[jax.Array, jax.Array]:
+        action, uncertainty = parts.learner.predict(policy, pairs.obs)
         error = jnp.mean((action - pairs.action) ** 2, axis=-1)
         valid = jnp.arange(error.size) < size
         return jnp.mean(error, where=valid), jnp.mean(uncertainty, where=valid)

@@ -13,7 +13,7 @@ from fleetjax.config import Config
 from fleetjax.io import figure, files, folder, text
 from fleetjax.metrics import Metrics
 
-ALGORITHMS = ("constraint", "random", "ensemble_dagger", "thrifty_dagger", "cur", "expert")
+ALGORITHMS = ("constraint", "constraint_trained", "random", "ensemble_dagger", "thrifty_dagger", "cur", "expert")
 COLUMNS = {"successes": "successes", "violations": "violations", "idle": "idle", "human_steps": "human time"}
 Case = tuple[str, str, int]  # environment, algorithm, seed
 

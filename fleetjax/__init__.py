@@ -4,12 +4,14 @@ from fleetjax import envs
 from fleetjax.allocation import allocate
 from fleetjax.config import Config, make_config, validate
 from fleetjax.envs import Env, EnvSpec, list_envs, register_env
-from fleetjax.fleet import Fleet, FleetState, Interventions, Plan, make_fleet
+from fleetjax.field import Field
+from fleetjax.fleet import Fleet, FleetState, make_fleet
+from fleetjax.learning.estimators import Estimator, Step, register_estimator
 from fleetjax.metrics import Metrics, first_divergence, rohe
 from fleetjax.priority import Algorithm, Priority, list_algorithms, register_algorithm, register_priority
 from fleetjax.run import Result, evaluate, extend, prepare, run, run_logged
 from fleetjax.supervisors import Supervisor, list_supervisors, register_supervisor
-from fleetjax.types import EnvState, HumanState, Signals
+from fleetjax.types import EnvState, HumanState, Interventions, Plan, Signals
 from fleetjax.version import VERSION
 
 __version__ = VERSION
@@ -19,6 +21,8 @@ __all__ = [
     "Env",
     "EnvSpec",
     "EnvState",
+    "Estimator",
+    "Field",
     "Fleet",
     "FleetState",
     "HumanState",
@@ -28,6 +32,7 @@ __all__ = [
     "Priority",
     "Result",
     "Signals",
+    "Step",
     "Supervisor",
     "allocate",
     "envs",
@@ -42,6 +47,7 @@ __all__ = [
     "prepare",
     "register_algorithm",
     "register_env",
+    "register_estimator",
     "register_priority",
     "register_supervisor",
     "rohe",

@@ -1,10 +1,16 @@
 """Who helps whom: Fleet-DAgger's allocation of humans to robots (paper, Algorithm 1)."""
 
+from collections.abc import Callable
+
 import chex
 import jax
 import jax.numpy as jnp
 
-from fleetjax.types import HumanState
+from fleetjax.types import HumanState, Signals
+
+# `(score f32[N], humans HumanState[M], min_time i32[N], key, available bool[M] | None, signals | None) -> HumanState[M]`.
+# It keeps humans who are bound, as `allocate` does, and helps nobody whose score is 0.
+Allocator = Callable[..., HumanState]
 
 
 def allocate(
@@ -13,6 +19,7 @@ def allocate(
     min_time: jax.Array,
     key: jax.Array,
     available: jax.Array | None = None,
+    signals: Signals | None = None,
 ) -> HumanState:
     """Assign humans to the robots with the highest positive scores.
 
@@ -26,6 +33,7 @@ def allocate(
         min_time: i32[N] shortest intervention on each robot (timesteps).
         key: random key, for ties.
         available: bool[M] humans who are there; None = all.
+        signals: Signals[N], for allocators that look at more than scores; this one does not.
 
     Returns:
         HumanState[M]: `duration` is unchanged for a human that stays and 0 for one newly assigned or free.
@@ -36,6 +44,7 @@ def allocate(
 
     Reference: Fleet-DAgger, Section 4.1 and Appendix (Algorithm 1).
     """
+    del signals
     num_robots, num_humans = score.shape[0], humans.robot.shape[0]
     chex.assert_shape([score, min_time], (num_robots,))
     chex.assert_shape([humans.robot, humans.duration], (num_humans,))

@@ -12,13 +12,12 @@ from jax.core import Tracer
 from fleetjax import envs
 from fleetjax.config import Config, taught_pairs, validate
 from fleetjax.envs import Env
-from fleetjax.fleet import FleetState, init_state
-from fleetjax.learning import critic, imitation
+from fleetjax.fleet import FleetState, init, make_parts
+from fleetjax.learning import imitation
 from fleetjax.learning.buffer import Buffer
 from fleetjax.learning.networks import Normalizer
 from fleetjax.metrics import Metrics
 from fleetjax.precision import in_32_bits
-from fleetjax.priority import get_algorithm
 
 _GIB = 2**30
 # Where Linux keeps the limit of a container's memory: control groups, version 2 and 1.
@@ -30,14 +29,11 @@ def state_shapes(config: Config, env: Env) -> FleetState:
     """Return shapes and types of a fleet's state; nothing is computed."""
 
     def blank(config: Config, key: jax.Array) -> FleetState:
-        learner = imitation.make_learner(config, env.spec)
+        parts = make_parts(config, env)
         zeros = jnp.zeros(env.spec.observation_size)
         data = imitation.create_data(env.spec, ensemble_size=config.ensemble_size, capacity=config.human_capacity)
-        critics = {
-            kind: critic.make_critic(kind, config, env.spec, learner).init(key)
-            for kind in get_algorithm(config.algorithm).critics
-        }
-        return init_state(config, env, key, learner.init(key, Normalizer(zeros, zeros, zeros[0])), data, critics)
+        policy = parts.learner.init(key, Normalizer(zeros, zeros, zeros[0]))
+        return init(parts, key, policy, data, {name: e.init(key, data, policy) for name, e in parts.estimators.items()})
 
     return jax.eval_shape(blank, config, jax.random.key(0))
 
@@ -65,12 +61,13 @@ def check_memory(config: Config, env: Env) -> None:
         ValueError: if they do not; the message has the estimate, the memory there is, and the fields to reduce.
     """
     state = state_shapes(config, env)
-    critics = [store.params for store in state.critics.values()]
+    learnt = jax.tree.leaves(state.estimators, is_leaf=lambda x: isinstance(x, Buffer))
+    stores = [x for x in learnt if isinstance(x, Buffer)]
     parts = {
         "num_robots": _bytes(state.env),
-        "hidden_sizes": 4 * _bytes((state.learner.params, critics)),  # with Adam's two moments, and the gradients
+        "hidden_sizes": 2 * _bytes(state.policy) + _bytes([x for x in learnt if not isinstance(x, Buffer)]),
         "human_capacity": _bytes(state.human_data),
-        "critic_capacity": sum(_bytes((store.positives, store.negatives)) for store in state.critics.values()),
+        "critic_capacity": _bytes(stores),
         "num_steps": config.num_steps * 4 * len(Metrics._fields),
     }
     needed, limit = sum(parts.values()), _memory()
@@ -117,7 +114,7 @@ def check_state(config: Config, env: Env, state: FleetState) -> None:
     wanted, given = _layout(state_shapes(config, env)), _layout(state)
     if jax.tree.structure(wanted) != jax.tree.structure(given):
         raise ValueError(
-            f"algorithm = {config.algorithm!r} keeps other critics or another memory than {made.algorithm!r}, for which the "
+            f"algorithm = {config.algorithm!r} keeps other estimators or another memory than {made.algorithm!r}, for which the "
             "state was prepared; prepare one for it"
         )
     for (path, found), leaf in zip(jax.tree_util.tree_leaves_with_path(given), jax.tree.leaves(wanted), strict=True):

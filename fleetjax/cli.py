@@ -18,7 +18,7 @@ import numpy as np
 
 from fleetjax import envs
 from fleetjax.checks import check_run
-from fleetjax.config import FIELDS, Config, make_config
+from fleetjax.config import every_field, make_config
 from fleetjax.console.controls import CONTROLS
 from fleetjax.console.replaying import Disagreement
 from fleetjax.envs import get_defaults, list_envs
@@ -82,7 +82,7 @@ def _refusing() -> Iterator[None]:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    overrides = {name: value for name, value in vars(arguments).items() if name in FIELDS}
+    overrides = {name: value for name, value in vars(arguments).items() if name in every_field()}
     with _refusing():
         if arguments.checkpoint_every < 0 or arguments.checkpoint_every == 1:
             raise ValueError(f"checkpoint_every = {arguments.checkpoint_every} must be 0 (none) or at least 2 timesteps")
@@ -168,11 +168,14 @@ def _list(arguments: argparse.Namespace) -> None:
         rows.append(("", name, *sizes, f"{1000 * spec.control_step:.1f} ms", "yes" if spec.has_goal else "no"))
     print(text.table(rows, right=[2, 3, 4, 5]))
     for name in list_envs():
-        changed = {field: value for field, value in get_defaults(name).items() if value != getattr(Config, field)}
+        changed = {field: value for field, value in get_defaults(name).items() if value != every_field()[field].default}
         print(f"  {name}'s own defaults: {', '.join(f'{field} {flags.show(value)}' for field, value in changed.items())}")
     print("\nalgorithms")
     named = [name for name in list_algorithms() if not text.is_order(name) or name == "cur"]
     print(text.table([("", name, text.label(name), text.meaning(name)) for name in named]))
+    for name in list_algorithms():
+        for own, field in get_algorithm(name).parameters.items():
+            print(f"  {name}'s own parameter: {own} {flags.show(field.default)}, {field.help}")
     print(f"  and {text.ORDERS}")
 
 
@@ -273,7 +276,7 @@ def _render(arguments: argparse.Namespace) -> None:
 def _console(arguments: argparse.Namespace) -> None:
     from fleetjax.console import command
 
-    given = {name: value for name, value in vars(arguments).items() if name in FIELDS}
+    given = {name: value for name, value in vars(arguments).items() if name in every_field()}
     with _refusing():
         arguments.seed = 0 if arguments.seed is None else arguments.seed
         run = _to_begin(argparse.Namespace(**vars(arguments), log_interventions=False), given)

@@ -6,7 +6,7 @@ paper's (Section 5.2 and Appendix); environments change some of them, see `fleet
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,42 +14,29 @@ import numpy as np
 from jax.core import Tracer
 
 from fleetjax import envs, priority, supervisors
+from fleetjax.field import Field
 from fleetjax.physics.base import BACKENDS
-
-
-class Field(NamedTuple):
-    """What is known of a `Config` field besides its default.
-
-    Attributes:
-        help: meaning.
-        unit: unit, or "".
-        kind: `str`, `int`, `float`, `bool` or `tuple`.
-        traced: whether it is an array that can be swept without compiling anew.
-        low: smallest allowed value.
-        high: largest allowed value.
-    """
-
-    help: str
-    unit: str
-    kind: type
-    traced: bool
-    low: float | None
-    high: float | None
+from fleetjax.registry import unknown
 
 
 def _static(default: Any, help: str, unit: str = "", *, low: float | None = None) -> Any:
-    field = Field(help, unit, type(default), False, low, None)
+    field = Field(help, unit, type(default), False, low, None, default)
     return dataclasses.field(default=default, metadata={"field": field})
 
 
 def _traced(default: Any, help: str, unit: str = "", *, low: float | None = 0, high: float | None = None) -> Any:
-    field = Field(help, unit, type(default), True, low, high)
+    field = Field(help, unit, type(default), True, low, high, default)
     return dataclasses.field(default=default, metadata={"field": field})
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Parameters of a run. Make one with `make_config`; change one with `replace`."""
+    """Parameters of a run. Make one with `make_config`; change one with `replace`.
+
+    Attributes:
+        parameters: the algorithm's own, by name: f32, i32 or bool scalars, traced.
+        capacity_given: whether `human_capacity` was asked for; else it follows from the other fields.
+    """
 
     environment: str = _static("humanoid", "registered environment")
     algorithm: str = _static("cur", "registered algorithm, or an order of the letters c, u, r")
@@ -71,9 +58,6 @@ class Config:
     initial_period: int = _traced(0, "time t_I before orders with C help robots in violation", "timesteps")
     uncertainty_threshold: float = _traced(0.05, "uncertainty below which U is 0; in nats where actions are discrete")
     risk_threshold: float = _traced(0.5, "risk below which R is 0", high=1)
-    random_threshold: float = _traced(0.9, "priority of `random` below which it is 0", high=1)
-    thrifty_weight: float = _traced(0.25, "weight of the chance of failure in `thrifty_dagger`", high=1)
-    thrifty_threshold: float = _traced(3.25, "normalised priority of `thrifty_dagger` at or below which it is 0")
     learning_rate: float = _traced(3e-4, "Adam's learning rate, policy and critics")
     normalize_observations: bool = _traced(
         True, "scale observations by the demonstrations' mean and deviation (images: always alike)"
@@ -89,20 +73,28 @@ class Config:
     goal_discount: float = _traced(0.999, "discount of the goal critic", high=1)
     target_rate: float = _traced(2e-4, "rate at which target networks follow, each gradient step", high=1)
 
-    capacity_given: bool = False  # whether `human_capacity` was asked for; else it follows from the other fields
+    parameters: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    capacity_given: bool = False
 
     def replace(self, **changes: Any) -> "Config":
-        """Return a config with some fields changed; traced ones become i32, f32 or bool scalars.
+        """Return a config with some fields, or parameters of its algorithm, changed.
+
+        Traced ones become i32, f32 or bool scalars. A new algorithm brings its own parameters, with their defaults.
 
         Raises:
-            ValueError: if a field is unknown, an integer field gets a value that is none, or the number of demonstrations is
-                traced and no `human_capacity` says how many pairs there may be.
+            ValueError: if a field is unknown, a parameter is another algorithm's, an integer field gets a value that is none,
+                or the number of demonstrations is traced and no `human_capacity` says how many pairs there may be.
         """
+        known = all_fields(changes.get("algorithm", self.algorithm))
         for name in changes:
-            if name not in FIELDS:
-                raise ValueError(priority.unknown("config field", name, FIELDS))
-        changed = dataclasses.replace(self, **{name: _typed(name, value) for name, value in changes.items()})
-        return _with_capacity(self, changed, changes)
+            if name not in known:
+                raise ValueError(_not_known(name, changes.get("algorithm", self.algorithm)))
+        typed = {name: _typed(name, known[name], value) for name, value in changes.items()}
+        own = self.parameters
+        if "algorithm" in changes and changes["algorithm"] != self.algorithm:
+            own = _default_parameters(changes.get("environment", self.environment), changes["algorithm"])
+        own = {**own, **{name: typed.pop(name) for name in list(typed) if name not in FIELDS}}
+        return _with_capacity(self, dataclasses.replace(self, **typed, parameters=own), changes)
 
 
 FIELDS: dict[str, Field] = {f.name: f.metadata["field"] for f in dataclasses.fields(Config) if "field" in f.metadata}
@@ -111,20 +103,63 @@ _LARGEST_EXACT = 2**24  # beyond it f32 skips whole numbers
 _OFFLINE = ("num_demonstrations", "extra_demonstrations")
 _TRACED = [name for name, field in FIELDS.items() if field.traced]
 _STATIC = [name for name, field in FIELDS.items() if not field.traced]
-jax.tree_util.register_dataclass(Config, data_fields=_TRACED, meta_fields=[*_STATIC, "capacity_given"])
+jax.tree_util.register_dataclass(Config, data_fields=[*_TRACED, "parameters"], meta_fields=[*_STATIC, "capacity_given"])
 
 
-def _typed(name: str, value: Any) -> Any:
+def all_fields(algorithm: str) -> dict[str, Field]:
+    """Return the fields of `Config` and the parameters of a registered algorithm, by name.
+
+    Raises:
+        ValueError: if the algorithm is unknown.
+    """
+    return FIELDS | dict(priority.get_algorithm(algorithm).parameters)
+
+
+def every_field() -> dict[str, Field]:
+    """Return the fields of `Config` and the parameters of all registered algorithms, by name."""
+    own = {
+        name: field for other in priority.list_algorithms() for name, field in priority.get_algorithm(other).parameters.items()
+    }
+    return own | FIELDS
+
+
+def owners(name: str) -> tuple[str, ...]:
+    """Return the algorithms that have a parameter of this name."""
+    return tuple(other for other in priority.list_algorithms() if name in priority.get_algorithm(other).parameters)
+
+
+def get_value(config: Config, name: str) -> Any:
+    """Return the value of a field, or of a parameter of the algorithm."""
+    return getattr(config, name) if name in FIELDS else config.parameters[name]
+
+
+def _not_known(name: str, algorithm: str) -> str:
+    """Return the message for a name that is no field and none of an algorithm's parameters."""
+    others = owners(name)
+    if others:
+        have = ", ".join(map(repr, others))
+        return f"{name} is a parameter of algorithm = {have}, and not of {algorithm!r}; leave it out, or choose that algorithm"
+    return unknown("config field", name, all_fields(algorithm))
+
+
+def _default_parameters(environment: str, algorithm: str) -> dict[str, Any]:
+    """Return an algorithm's own parameters, with the defaults that an environment gives them."""
+    changed = envs.get_defaults(environment) if environment in envs.ENVIRONMENTS else {}
+    own = priority.get_algorithm(algorithm).parameters
+    return {name: _typed(name, field, changed.get(name, field.default)) for name, field in own.items()}
+
+
+def _typed(name: str, field: Field, value: Any) -> Any:
     """Return a value as its field holds it.
 
     Raises:
         ValueError: if it has another type, or is an integer beyond 32 bits.
     """
-    return _as_array(name, value) if FIELDS[name].traced else _as_static(name, value)
+    return _as_array(name, field, value) if field.traced else _as_static(name, field, value)
 
 
-def _as_static(name: str, value: Any) -> Any:
-    kind = FIELDS[name].kind
+def _as_static(name: str, field: Field, value: Any) -> Any:
+    kind = field.kind
     if kind is str and isinstance(value, str):
         return value
     if kind is str or not (isinstance(value, (tuple, list)) if kind is tuple else _is_integer(value)):
@@ -141,8 +176,8 @@ def _is_integer(value: Any) -> bool:
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
 
-def _as_array(name: str, value: Any) -> jax.Array:
-    kind = FIELDS[name].kind
+def _as_array(name: str, field: Field, value: Any) -> jax.Array:
+    kind = field.kind
     array = value if isinstance(value, jax.Array) else np.asarray(value)
     is_bool, is_int, is_float = (jnp.issubdtype(array.dtype, t) for t in (jnp.bool_, jnp.integer, jnp.floating))
     if kind is bool:
@@ -153,7 +188,7 @@ def _as_array(name: str, value: Any) -> jax.Array:
         huge = isinstance(value, int) and not isinstance(value, bool)  # beyond what NumPy holds
         raise ValueError(f"{name} = {value!r} must {'lie within 32 bits' if huge else 'be a number'}")
     if kind is int:
-        _check_whole(name, array)
+        _check_whole(name, field, array)
     return _on_device(array, jnp.int32 if kind is int else jnp.float32)
 
 
@@ -165,7 +200,7 @@ def _on_device(array: "jax.Array | np.ndarray", dtype: Any) -> jax.Array:
         return jnp.asarray(array, dtype)
 
 
-def _check_whole(name: str, array: "jax.Array | np.ndarray") -> None:
+def _check_whole(name: str, field: Field, array: "jax.Array | np.ndarray") -> None:
     """Check that numbers are whole and lie within 32 bits.
 
     Raises:
@@ -174,11 +209,11 @@ def _check_whole(name: str, array: "jax.Array | np.ndarray") -> None:
     is_float = jnp.issubdtype(array.dtype, jnp.floating)
     if not _is_concrete(array):
         if is_float:
-            raise ValueError(f"{name} = {array} must be a whole number of {FIELDS[name].unit}")
+            raise ValueError(f"{name} = {array} must be a whole number of {field.unit}")
         return
     values = np.asarray(array, np.float64)
     if not np.all(np.isfinite(values) & (values == np.round(values))):
-        raise ValueError(f"{name} = {array} must be a whole number of {FIELDS[name].unit}")
+        raise ValueError(f"{name} = {array} must be a whole number of {field.unit}")
     if np.any(np.abs(values) > _LARGEST):
         raise ValueError(f"{name} = {array} must lie within 32 bits")
     if is_float and np.any(np.abs(values) > _LARGEST_EXACT):
@@ -236,10 +271,10 @@ def make_config(environment: "str | envs.Env", algorithm: str = "cur", **overrid
     Args:
         environment: registered name, or an `Env` to be passed to `run` as well.
         algorithm: registered name.
-        **overrides: fields of `Config`.
+        **overrides: fields of `Config`, and the algorithm's own parameters.
 
     Raises:
-        ValueError: if a name or a field is unknown, or a value is out of range.
+        ValueError: if a name or a field is unknown, a parameter is another algorithm's, or a value is out of range.
 
     >>> config = make_config("navigation", "cur", num_robots=20)
     >>> config.num_robots, int(config.min_teleop_time)
@@ -247,22 +282,19 @@ def make_config(environment: "str | envs.Env", algorithm: str = "cur", **overrid
 
     Reference: paper, Section 5.2 and Appendix (simulation hyper-parameters).
     """
-    if isinstance(environment, envs.Env):
-        name, defaults = environment.spec.name, {}
-    else:
-        name, defaults = environment, envs.get_defaults(environment)
-    priority.get_algorithm(algorithm)
-    fields: dict[str, Any] = {name: getattr(Config, name) for name in FIELDS} | dict(defaults)
-    fields |= {"environment": name, "algorithm": algorithm} | overrides
-    if algorithm == "expert" and "num_humans" not in overrides:
-        fields["num_humans"] = fields["num_robots"]
-    config = Config().replace(**fields)
-    if algorithm == "constraint":  # as many gradient steps as the online arms, and as many human timesteps
-        steps = int(config.pretraining_steps) if _is_concrete(config.pretraining_steps) else config.pretraining_steps
-        budget = {"pretraining_steps": steps + config.num_steps * config.gradient_steps}
-        budget["extra_demonstrations"] = envs.CUR_HUMAN_TIME.get(name, 0)
-        config = config.replace(**{field: value for field, value in budget.items() if field not in overrides})
-    validate(config, environment if isinstance(environment, envs.Env) else None)
+    env = environment if isinstance(environment, envs.Env) else None
+    name = env.spec.name if env else str(environment)
+    defaults = {} if env else envs.get_defaults(name)
+    known = all_fields(algorithm)
+    for override in overrides:
+        if override not in known:
+            raise ValueError(_not_known(override, algorithm))
+    of_place = {key: value for key, value in defaults.items() if key in known}
+    of_field = {key: field.default for key, field in known.items()}
+    config = Config().replace(**of_field | of_place | {"environment": name, "algorithm": algorithm} | overrides)
+    of_algorithm = priority.get_algorithm(algorithm).defaults(config)
+    config = config.replace(**{key: value for key, value in of_algorithm.items() if key not in overrides})
+    validate(config, env)
     return config
 
 
@@ -276,8 +308,8 @@ def validate(config: Config, env: "envs.Env | None" = None) -> None:
     Raises:
         ValueError: naming the field, its value and what is allowed.
     """
-    for name, field in FIELDS.items():
-        _check_range(name, getattr(config, name), field)
+    for name, field in all_fields(config.algorithm).items():
+        _check_range(name, get_value(config, name), field)
     if config.num_humans > config.num_robots:
         raise ValueError(
             f"num_humans = {config.num_humans} is more than num_robots = {config.num_robots}; a human helps one robot at a time"
@@ -285,14 +317,14 @@ def validate(config: Config, env: "envs.Env | None" = None) -> None:
     if not config.hidden_sizes or min(config.hidden_sizes) < 1:
         raise ValueError(f"hidden_sizes = {config.hidden_sizes} must name one or more layers of at least 1 unit")
     if config.backend not in BACKENDS:
-        raise ValueError(priority.unknown("backend", config.backend, BACKENDS))
+        raise ValueError(unknown("backend", config.backend, BACKENDS))
     algorithm = priority.get_algorithm(config.algorithm)
     if config.algorithm == "expert" and config.num_humans != config.num_robots:
         raise ValueError(
             f"num_humans = {config.num_humans} must equal num_robots = {config.num_robots} for algorithm = 'expert', "
             "which teleoperates every robot"
         )
-    if algorithm.critics and config.critic_capacity < config.num_robots:
+    if algorithm.estimators and config.critic_capacity < config.num_robots:
         raise ValueError(f"critic_capacity = {config.critic_capacity} must be at least num_robots = {config.num_robots}")
     if algorithm.pretrains or algorithm.updates:
         _check_data(config, algorithm)
@@ -303,7 +335,7 @@ def validate(config: Config, env: "envs.Env | None" = None) -> None:
             f"augmented_copies = {config.augmented_copies} needs images, and environment = {env.spec.name!r} has none; "
             "leave it at 1"
         )
-    if "goal" in algorithm.critics and not env.spec.has_goal:
+    if "goal" in algorithm.estimators and not env.spec.has_goal:
         raise ValueError(
             f"algorithm = {config.algorithm!r} needs a goal to learn from, and environment = {env.spec.name!r} has none; "
             "choose another algorithm, or an environment with goals"

@@ -6,22 +6,26 @@ them. This is the only module that maps over robots.
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import chex
 import jax
 import jax.numpy as jnp
 
-from fleetjax import priority, supervisors, tree
-from fleetjax.allocation import allocate, helper_of
+from fleetjax import metrics, priority, supervisors
+from fleetjax.allocation import Allocator, helper_of
 from fleetjax.config import Config
 from fleetjax.envs import Env
-from fleetjax.learning import critic, imitation
+from fleetjax.learning import buffer, imitation
+from fleetjax.learning.estimators import ESTIMATORS, Estimator, Step
+from fleetjax.learning.imitation import HumanData, Learner, Pair, PolicyState
 from fleetjax.metrics import Metrics
 from fleetjax.precision import in_32_bits
-from fleetjax.types import EnvState, HumanState, Signals
-
-CRITICS = ("safety", "goal")  # in the order of `metrics.LEARNT`
+from fleetjax.priority import Algorithm, Priority
+from fleetjax.supervisors import Supervisor
+from fleetjax.tree import finite, take, where
+from fleetjax.types import EnvState, HumanState, Interventions, Plan, Signals
 
 
 @jax.tree_util.register_static
@@ -41,9 +45,10 @@ class FleetState(NamedTuple):
         env: EnvState[N].
         humans: HumanState[M] at the end of the last timestep.
         resetting: bool[N] type of each robot's last intervention: hard reset, or teleoperation.
-        learner: the robots' policy.
-        human_data: what it learns from.
-        critics: `CriticState` by kind, those that the algorithm needs.
+        correction: f32[N] see `Signals`.
+        policy: what the robots have learnt.
+        human_data: what they learn from.
+        estimators: state of each estimator that the algorithm names, by name.
         priority: the priority's own memory.
         origin: what it was prepared for.
     """
@@ -52,239 +57,248 @@ class FleetState(NamedTuple):
     env: EnvState
     humans: HumanState
     resetting: jax.Array
-    learner: imitation.LearnerState
-    human_data: imitation.HumanData
-    critics: dict[str, critic.CriticState]
+    correction: jax.Array
+    policy: PolicyState
+    human_data: HumanData
+    estimators: dict[str, Any]
     priority: Any
     origin: Origin = Origin("", "")
 
-
-class Plan(NamedTuple):
-    """Who needs whom at this timestep.
-
-    Attributes:
-        signals: Signals[N] that the scores were made from.
-        robot_action: f32[N, A] what the robots' policy would do.
-        score: f32[N] priorities.
-        humans: HumanState[M], the allocation; `duration` counts the timesteps before this one.
-        teleoperated: bool[N] robots that a human teleoperates.
-        resetting: bool[N] robots that a human resets.
-    """
-
-    signals: Signals
-    robot_action: jax.Array
-    score: jax.Array
-    humans: HumanState
-    teleoperated: jax.Array
-    resetting: jax.Array
+    @property
+    def learner(self) -> PolicyState:
+        """The policy, by its name in version 0.1."""
+        return self.policy
 
 
-class Interventions(NamedTuple):
-    """Whom each human teleoperates at a timestep, and what came of it; [M], after a run [T, M].
+class Parts(NamedTuple):
+    """What a fleet is made of."""
 
-    Attributes:
-        robot: i32 index of the robot, -1 = the human teleoperates nobody, and the rest is of no meaning.
-        priority: f32 the robot's score.
-        step: i32 its control steps since its reset, before this one.
-        obs: f32[O] what the human and the robot's policy saw.
-        robot_action: f32[A] what the policy would have done.
-        human_action: f32[A] what was done.
-        next_obs: f32[O] after it, before any reset or new goal.
-        reward: f32 of that step.
-        violation: bool whether it led to a violation.
-        success: bool whether it completed the task.
-        timeout: bool whether it reached the horizon.
-    """
-
-    robot: jax.Array
-    priority: jax.Array
-    step: jax.Array
-    obs: jax.Array
-    robot_action: jax.Array
-    human_action: jax.Array
-    next_obs: jax.Array
-    reward: jax.Array
-    violation: jax.Array
-    success: jax.Array
-    timeout: jax.Array
+    config: Config
+    env: Env
+    algorithm: Algorithm
+    rule: Priority
+    allocate: Allocator
+    supervisor: Supervisor
+    learner: Learner
+    estimators: dict[str, Estimator]
 
 
 class Fleet(NamedTuple):
     """Pure functions of a fleet. Keys: one a timestep, `fold_in(key, t)`.
 
     Attributes:
+        init: `(key, PolicyState, HumanData, estimators' states) -> FleetState` at t = 0.
         plan: `(state, key, available bool[M] | None) -> (state, Plan)`.
         advance: `(state, Plan, human_action f32[N, A], given bool[N], key) -> (state, Metrics)`. `given` marks robots whose
             supervisor really gave that action; on other robots the policy acts, and nothing is recorded.
         step: `(state, key) -> (state, Metrics)`, with the simulated supervisor.
-        logged_step: `(state, key) -> (state, (Metrics, Interventions[M]))`, the same and what the supervisor did.
     """
 
+    init: Callable[..., FleetState]
     plan: Callable[..., tuple[FleetState, Plan]]
     advance: Callable[..., tuple[FleetState, Metrics]]
     step: Callable[[FleetState, jax.Array], tuple[FleetState, Metrics]]
-    logged_step: Callable[[FleetState, jax.Array], tuple[FleetState, tuple[Metrics, Interventions]]]
-
-
-def init_state(
-    config: Config,
-    env: Env,
-    key: jax.Array,
-    policy: imitation.LearnerState,
-    data: imitation.HumanData,
-    critics: dict[str, critic.CriticState],
-) -> FleetState:
-    """Return the state at t = 0: robots freshly reset, humans free."""
-    robots = jnp.arange(config.num_robots)
-    return FleetState(
-        timestep=jnp.zeros((), jnp.int32),
-        env=jax.vmap(env.reset)(jax.random.split(key, config.num_robots), robots),
-        humans=HumanState(jnp.full(config.num_humans, -1, jnp.int32), jnp.zeros(config.num_humans, jnp.int32)),
-        resetting=jnp.zeros(config.num_robots, bool),
-        learner=policy,
-        human_data=data,
-        critics=critics,
-        priority=priority.get_algorithm(config.algorithm).make_priority(config).init(),
-        origin=Origin(env.spec.name, config.algorithm),
-    )
 
 
 @in_32_bits
-def make_fleet(config: Config, env: Env) -> Fleet:
-    """Compose environment, policy, critics, priority and supervisor into the timestep of a fleet."""
+def make_parts(config: Config, env: Env) -> Parts:
+    """Make what a configuration names."""
     algorithm = priority.get_algorithm(config.algorithm)
-    rule = algorithm.make_priority(config)
     supervisor = supervisors.make(config.supervisor or env.spec.supervisor, env)
     learner = imitation.make_learner(config, env.spec)
-    critics = {kind: critic.make_critic(kind, config, env.spec, learner) for kind in algorithm.critics}
-    learn = _make_learning(config, learner, critics)
-    num_robots = config.num_robots
-    robots = jnp.arange(num_robots)
+    estimators = {name: ESTIMATORS.get(name)(config, env, learner, supervisor) for name in algorithm.estimators}
+    rule, allocator = algorithm.make_priority(config), algorithm.make_allocate(config)
+    return Parts(config, env, algorithm, rule, allocator, supervisor, learner, estimators)
 
-    def observe(state: FleetState) -> tuple[Signals, jax.Array]:
-        """Return the signals and what the robots' policy would do."""
-        obs = state.env.obs
-        action, uncertainty = learner.predict(state.learner, obs)
-        chance = {kind: c.value(state.critics[kind], state.learner.normalizer, obs, action) for kind, c in critics.items()}
-        never = jnp.zeros(num_robots)
-        signals = (uncertainty, chance.get("safety", never), chance.get("goal", never))
-        uncertainty, risk, goal = (jnp.where(jnp.isfinite(x), x, 0.0) for x in signals)  # one robot must not spoil the ranks
-        return Signals(state.env.violation, uncertainty, risk, goal, state.timestep), action
 
-    def plan(state: FleetState, key: jax.Array, available: jax.Array | None = None) -> tuple[FleetState, Plan]:
-        key_score, key_ties = jax.random.split(key)
-        signals, robot_action = observe(state)
-        score, memory = rule.score(signals, state.priority, key_score)
-        min_time = jnp.where(state.resetting, config.hard_reset_time, config.min_teleop_time)
-        humans = allocate(score, state.humans, min_time, key_ties, available)
-        helped = helper_of(humans, num_robots) >= 0
-        resetting, teleoperated = helped & signals.violation, helped & ~signals.violation
-        humans = _restart_clocks(humans, state.resetting, resetting, config.hard_reset_time)
-        return state._replace(priority=memory), Plan(signals, robot_action, score, humans, teleoperated, resetting)
+def make_fleet(config: Config, env: Env) -> Fleet:
+    """Compose environment, policy, estimators, priority, allocator and supervisor into the timestep of a fleet."""
+    parts = make_parts(config, env)
 
     def advance(
         state: FleetState, plan: Plan, human_action: jax.Array, given: jax.Array, key: jax.Array
     ) -> tuple[FleetState, Metrics]:
-        state, metrics, _ = act(state, plan, human_action, given, key)
-        return state, metrics
-
-    def act(
-        state: FleetState, plan: Plan, human_action: jax.Array, given: jax.Array, key: jax.Array
-    ) -> tuple[FleetState, Metrics, EnvState]:
-        """Do what `advance` does; return also the robots' states after their step, before resets and new goals."""
-        chex.assert_shape(human_action, (num_robots, env.spec.action_size))
-        key_env, key_reset, key_goal, key_data, key_learn = jax.random.split(key, 5)
-        given = given & plan.teleoperated
-        moving = ~state.env.violation
-        obs = state.env.obs
-        action = jnp.where(given[:, None], human_action, plan.robot_action)
-
-        keys = jax.random.split(key_env, num_robots)
-        stepped = tree.where(moving, jax.vmap(env.step)(state.env, action, moving, keys), state.env)
-        sound = tree.finite((obs, action, stepped.obs, stepped.reward))
-        stepped = _contain(stepped, sound)
-        humans = plan.humans._replace(duration=jnp.where(plan.humans.robot >= 0, plan.humans.duration + 1, 0))
-
-        human_data, critic_states = state.human_data, state.critics
-        if algorithm.updates:
-            human_data = learner.append(human_data, imitation.Pair(obs, human_action), given & sound, key_data)
-        steps = critic.Transition(obs, action, stepped.obs, stepped.violation, stepped.success)
-        critic_states = {kind: c.append(critic_states[kind], steps, moving & sound) for kind, c in critics.items()}
-
-        helper = helper_of(humans, num_robots)
-        reset_done = plan.resetting & (humans.duration[helper] >= config.hard_reset_time)
-        ended = stepped.timeout if env.next_goal else stepped.timeout | stepped.success
-        fresh = jax.vmap(env.reset)(jax.random.split(key_reset, num_robots), robots)
-        after = tree.where(reset_done | (moving & ended), fresh, stepped)
-        if env.next_goal:
-            renewed = jax.vmap(env.next_goal)(after, jax.random.split(key_goal, num_robots))
-            after = tree.where(moving & stepped.success & ~ended, renewed, after)
-
-        policy, loss = state.learner, jnp.zeros(())
-        if algorithm.updates:
-            policy, critic_states, loss = learn(policy, human_data, critic_states, key_learn)
-
-        diverged = _diverged(policy, critic_states, state.priority)
-        dropped = human_data.dropped - jnp.where(state.timestep > 0, state.human_data.dropped, 0)
-        metrics = _measure(config, state, plan, stepped, moving, reset_done, dropped, diverged, loss)
-        state = state._replace(
-            timestep=state.timestep + 1,
-            env=after,
-            humans=humans,
-            resetting=plan.resetting,
-            learner=policy,
-            human_data=human_data,
-            critics=critic_states,
-        )
-        return state, metrics, stepped
-
-    def logged_step(state: FleetState, key: jax.Array) -> tuple[FleetState, tuple[Metrics, Interventions]]:
-        key_plan, key_human, key_advance = jax.random.split(key, 3)
-        state, plan_ = plan(state, key_plan)
-        human_action = jax.vmap(supervisor.act)(state.env, jax.random.split(key_human, num_robots))
-        after, metrics, stepped = act(state, plan_, human_action, plan_.teleoperated, key_advance)
-        return after, (metrics, _watch(state.env, plan_, human_action, stepped))
+        return act(parts, state, plan, human_action, given, key)[:2]
 
     def step(state: FleetState, key: jax.Array) -> tuple[FleetState, Metrics]:
-        after, (metrics, _) = logged_step(state, key)
-        return after, metrics
+        after, (counts, _) = logged_step(parts, state, key)
+        return after, counts
 
-    return Fleet(in_32_bits(plan), in_32_bits(advance), in_32_bits(step), in_32_bits(logged_step))
-
-
-def _make_learning(config: Config, learner: imitation.Learner, critics: dict[str, critic.Critic]) -> Callable[..., Any]:
-    """Return `(LearnerState, HumanData, critics' states, key) -> (LearnerState, critics' states, loss f32[])`."""
-
-    def learn(policy, human_data, critic_states, key):
-        """Take the timestep's gradient steps, policy first."""
-
-        def gradient_step(carry, key):
-            policy, states = carry
-            key_policy, key_critics = jax.random.split(key)
-            policy, loss = learner.update(policy, human_data, key_policy)
-            states = {kind: c.update(states[kind], policy, key_critics) for kind, c in critics.items()}
-            return (policy, states), loss
-
-        keys = jax.random.split(key, config.gradient_steps)
-        (policy, critic_states), losses = jax.lax.scan(gradient_step, (policy, critic_states), keys)
-        return policy, critic_states, jnp.sum(losses) / max(config.gradient_steps, 1)
-
-    return learn
+    return Fleet(in_32_bits(partial(init, parts)), in_32_bits(partial(plan, parts)), in_32_bits(advance), in_32_bits(step))
 
 
-def _watch(before: EnvState, plan: Plan, human_action: jax.Array, stepped: EnvState) -> Interventions:
-    """Return what each human did in a timestep that led the robots from `before` to `stepped`."""
-    robot = plan.humans.robot
-    actions = (plan.robot_action, human_action)
-    outcome = (stepped.obs, stepped.reward, stepped.violation, stepped.success, stepped.timeout)
-    score, step, obs, (planned, done), result = tree.take(
-        (plan.score, before.episode_step, before.obs, actions, outcome), jnp.maximum(robot, 0)
+def init(parts: Parts, key: jax.Array, policy: PolicyState, data: HumanData, estimators: dict[str, Any]) -> FleetState:
+    """Return the state at t = 0: robots freshly reset, humans free."""
+    config, n, m = parts.config, parts.config.num_robots, parts.config.num_humans
+    return FleetState(
+        timestep=jnp.zeros((), jnp.int32),
+        env=reset_robots(parts, key),
+        humans=HumanState(jnp.full(m, -1, jnp.int32), jnp.zeros(m, jnp.int32)),
+        resetting=jnp.zeros(n, bool),
+        correction=jnp.zeros(n, jnp.float32),
+        policy=policy,
+        human_data=data,
+        estimators=estimators,
+        priority=parts.rule.init(),
+        origin=Origin(parts.env.spec.name, config.algorithm),
     )
-    robot = jnp.where((robot >= 0) & plan.teleoperated[robot], robot, -1)
-    return Interventions(robot, score, step, obs, planned, done, *result)
 
 
-def _restart_clocks(
+def logged_step(parts: Parts, state: FleetState, key: jax.Array) -> tuple[FleetState, tuple[Metrics, Interventions]]:
+    """Take a timestep with the simulated supervisor; return also what each human who teleoperated saw and did."""
+    key_plan, key_human, key_advance = jax.random.split(key, 3)
+    state, planned = plan(parts, state, key_plan)
+    human_action = supervise(parts, state.env, key_human)
+    after, counts, stepped = act(parts, state, planned, human_action, planned.teleoperated, key_advance)
+    return after, (counts, watch(state.env, planned, human_action, stepped))
+
+
+def plan(parts: Parts, state: FleetState, key: jax.Array, available: jax.Array | None = None) -> tuple[FleetState, Plan]:
+    """Say who needs whom: signals, scores, allocation (paper, Section 4)."""
+    config = parts.config
+    key_score, key_ties = jax.random.split(key)
+    signals = observe(parts, state, key)
+    score, memory = parts.rule.score(signals, state.priority, key_score)
+    min_time = jnp.where(state.resetting, config.hard_reset_time, config.min_teleop_time)
+    humans = parts.allocate(score, state.humans, min_time, key_ties, available, signals)
+    helped = helper_of(humans, config.num_robots) >= 0
+    resetting, teleoperated = helped & signals.violation, helped & ~signals.violation
+    humans = restart_clocks(humans, state.resetting, resetting, config.hard_reset_time)
+    return state._replace(priority=memory), Plan(signals, signals.robot_action, score, humans, teleoperated, resetting)
+
+
+def act(
+    parts: Parts, state: FleetState, planned: Plan, human_action: jax.Array, given: jax.Array, key: jax.Array
+) -> tuple[FleetState, Metrics, EnvState]:
+    """Do what was planned; return also the robots' states after their step, before resets and new goals."""
+    chex.assert_shape(human_action, (parts.config.num_robots, parts.env.spec.action_size))
+    key_env, key_reset, key_goal, key_data, key_learn = jax.random.split(key, 5)
+    given, moving = given & planned.teleoperated, ~state.env.violation
+    action = jnp.where(given[:, None], human_action, planned.robot_action)
+    stepped, sound = step_robots(parts, state.env, action, moving, key_env)
+    steps = Step(state.env.obs, action, stepped.obs, stepped.violation, stepped.success, planned.robot_action, given)
+    humans = planned.humans._replace(duration=jnp.where(planned.humans.robot >= 0, planned.humans.duration + 1, 0))
+    correction = jnp.where(given, jnp.mean((human_action - planned.robot_action) ** 2, axis=-1), 0.0)
+    before, state = state, remember(parts, state, steps, given & sound, moving & sound, key_data)
+    renewed, reset_done = renew(parts, stepped, planned, humans, moving, key_reset, key_goal)
+    state, loss = learn(parts, state, key_learn)
+    state = state._replace(
+        timestep=before.timestep + 1, env=renewed, humans=humans, resetting=planned.resetting, correction=correction
+    )
+    dropped = state.human_data.dropped - jnp.where(before.timestep > 0, before.human_data.dropped, 0)
+    learnt = (reset_done, dropped, find_divergence(state), loss)
+    return state, metrics.measure(parts.config, planned, before.humans, stepped, moving, *learnt), stepped
+
+
+def observe(parts: Parts, state: FleetState, key: jax.Array) -> Signals:
+    """Return what rules may look at. What is not finite is 0: one robot must not spoil the ranks."""
+    n, obs = parts.config.num_robots, state.env.obs
+    action, uncertainty = parts.learner.predict(state.policy, obs)
+    estimates = {
+        name: estimator.value(state.estimators[name], state.policy, obs, action) for name, estimator in parts.estimators.items()
+    }
+    uncertainty, estimates = jax.tree.map(lambda x: jnp.where(jnp.isfinite(x), x, 0.0), (uncertainty, estimates))
+    helper, never = helper_of(state.humans, n), jnp.zeros(n, jnp.float32)
+    return Signals(
+        violation=state.env.violation,
+        uncertainty=uncertainty,
+        risk=estimates.get("safety", never),
+        goal=estimates.get("goal", never),
+        timestep=state.timestep,
+        estimates=estimates,
+        obs=obs,
+        robot_action=action,
+        helped=helper >= 0,
+        help_time=jnp.where(helper >= 0, state.humans.duration[helper], 0),
+        correction=state.correction,
+        human_action=supervise(parts, state.env, jax.random.fold_in(key, 0)) if parts.algorithm.sees_supervisor else None,
+        link=jnp.ones(n, jnp.float32),
+    )
+
+
+def supervise(parts: Parts, env: EnvState, key: jax.Array) -> jax.Array:
+    """Return f32[N, A], what the simulated supervisor would do on each robot."""
+    return jax.vmap(parts.supervisor.act)(env, jax.random.split(key, parts.config.num_robots))
+
+
+def reset_robots(parts: Parts, key: jax.Array) -> EnvState:
+    """Return EnvState[N], each robot drawn from its own initial distribution."""
+    n = parts.config.num_robots
+    return jax.vmap(parts.env.reset)(jax.random.split(key, n), jnp.arange(n))
+
+
+def step_robots(
+    parts: Parts, env: EnvState, action: jax.Array, moving: jax.Array, key: jax.Array
+) -> tuple[EnvState, jax.Array]:
+    """Step the robots that move; return EnvState[N], and bool[N] who has finite numbers. Who has not is in violation."""
+    keys = jax.random.split(key, parts.config.num_robots)
+    stepped = where(moving, jax.vmap(parts.env.step)(env, action, moving, keys), env)
+    sound = finite((env.obs, action, stepped.obs, stepped.reward))
+    return contain(stepped, sound), sound
+
+
+def remember(parts: Parts, state: FleetState, steps: Step, taught: jax.Array, moved: jax.Array, key: jax.Array) -> FleetState:
+    """Record what humans did where they `taught` bool[N], and what happened where robots `moved` bool[N]."""
+    data = state.human_data
+    if parts.algorithm.updates:
+        data = parts.learner.append(data, Pair(steps.obs, steps.action), taught, key)
+    estimators = {name: estimator.append(state.estimators[name], steps, moved) for name, estimator in parts.estimators.items()}
+    return state._replace(human_data=data, estimators=estimators)
+
+
+def renew(
+    parts: Parts,
+    stepped: EnvState,
+    planned: Plan,
+    humans: HumanState,
+    moving: jax.Array,
+    key_reset: jax.Array,
+    key_goal: jax.Array,
+) -> tuple[EnvState, jax.Array]:
+    """Complete hard resets, reset whose episode ended, and draw new goals; return EnvState[N] and bool[N] hard resets."""
+    n, next_goal = parts.config.num_robots, parts.env.next_goal
+    reset_done = planned.resetting & (humans.duration[helper_of(humans, n)] >= parts.config.hard_reset_time)
+    ended = stepped.timeout if next_goal else stepped.timeout | stepped.success
+    after = where(reset_done | (moving & ended), reset_robots(parts, key_reset), stepped)
+    if next_goal:
+        with_goal = jax.vmap(next_goal)(after, jax.random.split(key_goal, n))
+        after = where(moving & stepped.success & ~ended, with_goal, after)
+    return after, reset_done
+
+
+def learn(parts: Parts, state: FleetState, key: jax.Array) -> tuple[FleetState, jax.Array]:
+    """Take the timestep's gradient steps, policy first; return also the mean imitation loss f32[]."""
+    if not parts.algorithm.updates:
+        return state, jnp.zeros((), jnp.float32)
+    number, data = parts.config.gradient_steps, state.human_data
+
+    def gradient_step(carry: tuple[PolicyState, dict[str, Any]], key: jax.Array):
+        policy, states = carry
+        key_policy, key_estimators = jax.random.split(key)
+        policy, loss = parts.learner.update(policy, data, key_policy)
+        states = {
+            name: estimator.update(states[name], policy, data, key_estimators) for name, estimator in parts.estimators.items()
+        }
+        return (policy, states), loss
+
+    carry = (state.policy, state.estimators)
+    (policy, estimators), losses = jax.lax.scan(gradient_step, carry, jax.random.split(key, number))
+    return state._replace(policy=policy, estimators=estimators), jnp.sum(losses) / max(number, 1)
+
+
+def watch(before: EnvState, planned: Plan, human_action: jax.Array, stepped: EnvState) -> Interventions:
+    """Return what each human did in a timestep that led the robots from `before` to `stepped`."""
+    robot = planned.humans.robot
+    actions = (planned.robot_action, human_action)
+    outcome = (stepped.obs, stepped.reward, stepped.violation, stepped.success, stepped.timeout)
+    score, step, obs, (proposed, done), result = take(
+        (planned.score, before.episode_step, before.obs, actions, outcome), jnp.maximum(robot, 0)
+    )
+    robot = jnp.where((robot >= 0) & planned.teleoperated[robot], robot, -1)
+    return Interventions(robot, score, step, obs, proposed, done, *result)
+
+
+def restart_clocks(
     humans: HumanState, was_resetting: jax.Array, resetting: jax.Array, hard_reset_time: jax.Array | int
 ) -> HumanState:
     """Return `humans` with duration 0 where the kind of intervention changed, or the last hard reset is completed."""
@@ -293,7 +307,7 @@ def _restart_clocks(
     return humans._replace(duration=jnp.where(changed | completed, 0, humans.duration))
 
 
-def _contain(env: EnvState, sound: jax.Array) -> EnvState:
+def contain(env: EnvState, sound: jax.Array) -> EnvState:
     """Return EnvState[N] in which robots that are not `sound` bool[N] are in violation, and show nothing that is not finite."""
     obs, reward, episode_return = (jnp.where(jnp.isfinite(x), x, 0.0) for x in (env.obs, env.reward, env.episode_return))
     return env._replace(
@@ -306,49 +320,15 @@ def _contain(env: EnvState, sound: jax.Array) -> EnvState:
     )
 
 
-def _diverged(policy: imitation.LearnerState, critics: dict[str, critic.CriticState], memory: Any) -> jax.Array:
-    """Return i32[], the bits of what in `LEARNT` is not finite."""
-    learnt = [policy.params, *((critics[k].params, critics[k].target) if k in critics else () for k in CRITICS), memory]
-    flags = [~jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(part)])) for part in learnt]
+def find_divergence(state: FleetState) -> jax.Array:
+    """Return i32[], the sum of the bits of what in `metrics.LEARNT` is not finite; what buffers hold is left out."""
+    others = [learnt for name, learnt in state.estimators.items() if name not in ("safety", "goal")]
+    parts = (state.policy.params, state.estimators.get("safety"), state.estimators.get("goal"), state.priority, others)
+    flags = [~_all_finite(part) for part in parts]
     return sum((flag.astype(jnp.int32) << bit for bit, flag in enumerate(flags)), jnp.int32(0))
 
 
-def _measure(
-    config: Config,
-    state: FleetState,
-    plan: Plan,
-    stepped: EnvState,
-    moving: jax.Array,
-    reset_done: jax.Array,
-    dropped: jax.Array,
-    diverged: jax.Array,
-    loss: jax.Array,
-) -> Metrics:
-    """Count what happened in a timestep that began in `state` and led to `stepped`, before resets."""
-
-    def count(mask: jax.Array) -> jax.Array:
-        return jnp.sum(mask, dtype=jnp.int32)
-
-    helper = helper_of(plan.humans, config.num_robots)
-    switched = helper != helper_of(state.humans, config.num_robots)
-    chosen = switched & (helper >= 0)
-    certain = plan.signals.uncertainty < config.uncertainty_threshold
-    at_risk = plan.signals.risk >= config.risk_threshold
-    return Metrics(
-        successes=count(moving & stepped.success),
-        violations=count(moving & stepped.violation),
-        hard_resets=count(reset_done),
-        idle=count(~moving),
-        human_steps=count(helper >= 0),
-        teleop_steps=count(plan.teleoperated),
-        switches=count(switched),
-        moving=count(moving),
-        choices=count(chosen),
-        risk_choices=count(chosen & moving & certain & at_risk),
-        dropped=dropped,
-        diverged=diverged,
-        reward=jnp.sum(jnp.where(moving, stepped.reward, 0.0)),
-        uncertainty=jnp.sum(jnp.where(moving, plan.signals.uncertainty, 0.0))
-        / jnp.maximum(count(moving), 1).astype(jnp.float32),
-        policy_loss=loss,
-    )
+def _all_finite(learnt: Any) -> jax.Array:
+    leaves = jax.tree.leaves(learnt, is_leaf=lambda x: isinstance(x, buffer.Buffer))
+    numbers = [x for x in leaves if not isinstance(x, buffer.Buffer) and jnp.issubdtype(x.dtype, jnp.floating)]
+    return jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in numbers], bool))

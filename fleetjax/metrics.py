@@ -6,9 +6,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from fleetjax.allocation import helper_of
 from fleetjax.config import Config
+from fleetjax.types import EnvState, HumanState, Plan
 
-LEARNT = ("policy", "safety critic", "goal critic", "priority")  # what can diverge, in the order of its bits
+LEARNT = (
+    "policy",
+    "safety critic",
+    "goal critic",
+    "priority",
+    "another estimator",
+)  # what can diverge, in the order of its bits
 
 
 class Metrics(NamedTuple):
@@ -26,7 +34,7 @@ class Metrics(NamedTuple):
         choices: robots newly given to a human.
         risk_choices: those of them that only their risk spoke for: no violation, uncertainty below its threshold.
         dropped: pairs of human data for which there was no room; at t = 0 also those of the demonstrations.
-        diverged: what of `LEARNT` holds numbers that are not finite, the sum of 1, 2, 4 and 8 for each; see `first_divergence`.
+        diverged: what of `LEARNT` is not finite, the sum of 1, 2, 4, 8 and 16 for each; see `first_divergence`.
         reward: f32 sum of rewards over moving robots.
         uncertainty: f32 mean over moving robots.
         policy_loss: f32 mean imitation loss of the timestep's gradient steps.
@@ -78,3 +86,56 @@ def first_divergence(metrics: Metrics) -> tuple[int, tuple[str, ...]] | None:
         return None
     first = int(np.argmax(diverged != 0))
     return first, tuple(name for bit, name in enumerate(LEARNT) if diverged[first] >> bit & 1)
+
+
+def measure(
+    config: Config,
+    planned: Plan,
+    before: HumanState,
+    stepped: EnvState,
+    moving: jax.Array,
+    reset_done: jax.Array,
+    dropped: jax.Array,
+    diverged: jax.Array,
+    loss: jax.Array,
+) -> Metrics:
+    """Count what happened in a timestep.
+
+    Args:
+        config: configuration.
+        planned: who helped whom.
+        before: HumanState[M] at the end of the timestep before.
+        stepped: EnvState[N] after the step, before resets and new goals.
+        moving: bool[N] robots that acted.
+        reset_done: bool[N] hard resets completed.
+        dropped: i32[] pairs without room.
+        diverged: i32[] see `Metrics`.
+        loss: f32[] mean imitation loss.
+    """
+
+    def count(mask: jax.Array) -> jax.Array:
+        return jnp.sum(mask, dtype=jnp.int32)
+
+    helper = helper_of(planned.humans, config.num_robots)
+    switched = helper != helper_of(before, config.num_robots)
+    chosen = switched & (helper >= 0)
+    certain = planned.signals.uncertainty < config.uncertainty_threshold
+    at_risk = planned.signals.risk >= config.risk_threshold
+    return Metrics(
+        successes=count(moving & stepped.success),
+        violations=count(moving & stepped.violation),
+        hard_resets=count(reset_done),
+        idle=count(~moving),
+        human_steps=count(helper >= 0),
+        teleop_steps=count(planned.teleoperated),
+        switches=count(switched),
+        moving=count(moving),
+        choices=count(chosen),
+        risk_choices=count(chosen & moving & certain & at_risk),
+        dropped=dropped,
+        diverged=diverged,
+        reward=jnp.sum(jnp.where(moving, stepped.reward, 0.0)),
+        uncertainty=jnp.sum(jnp.where(moving, planned.signals.uncertainty, 0.0))
+        / jnp.maximum(count(moving), 1).astype(jnp.float32),
+        policy_loss=loss,
+    )

@@ -1,6 +1,7 @@
 """A whole experiment: pre-train, then one scan over the fleet's timesteps; and the evaluation of what was learnt."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -10,11 +11,12 @@ import numpy as np
 from fleetjax import envs
 from fleetjax.checks import check_run, check_state
 from fleetjax.config import Config
-from fleetjax.fleet import Fleet, FleetState, Interventions, init_state, make_fleet
-from fleetjax.learning.imitation import LearnerState, create_data
+from fleetjax.fleet import FleetState, init, logged_step, make_fleet, make_parts
+from fleetjax.learning.imitation import PolicyState, create_data
 from fleetjax.learning.pretraining import pretrain
 from fleetjax.metrics import Metrics
 from fleetjax.precision import in_32_bits
+from fleetjax.types import Interventions
 
 
 class Result(NamedTuple):
@@ -48,9 +50,14 @@ def prepare(config: Config, key: jax.Array, env: envs.Env | None = None) -> Flee
     """
     env = check_run(config, env)
     key_prepare, _ = jax.random.split(key)
-    key_pretrain, key_reset = jax.random.split(key_prepare)
-    policy, data, critics = pretrain(config, env, key_pretrain)
-    return init_state(config, env, key_reset, policy, data, critics)
+    key_policy, key_estimators, key_reset = jax.random.split(key_prepare, 3)
+    parts = make_parts(config, env)
+    policy, data = pretrain(config, env, parts.learner, parts.supervisor, key_policy)
+    estimators = {
+        name: estimator.init(jax.random.fold_in(key_estimators, i), data, policy)
+        for i, (name, estimator) in enumerate(parts.estimators.items())
+    }
+    return init(parts, key_reset, policy, data, estimators)
 
 
 def extend(state: FleetState, num_pairs: int) -> FleetState:
@@ -106,7 +113,7 @@ def run(config: Config, key: jax.Array, state: FleetState | None = None, env: en
 
     Reference: paper, Sections 3 and 4.
     """
-    metrics, last = _run(config, key, state, env, lambda fleet: fleet.step)
+    metrics, last = _run(config, key, state, env, lambda env: make_fleet(config, env).step)
     return Result(metrics, last)
 
 
@@ -128,20 +135,20 @@ def run_logged(
     Raises:
         ValueError: if the configuration is not valid.
     """
-    (metrics, interventions), last = _run(config, key, state, env, lambda fleet: fleet.logged_step)
+    (metrics, interventions), last = _run(config, key, state, env, lambda env: partial(logged_step, make_parts(config, env)))
     return Result(metrics, last), interventions
 
 
 def _run(
-    config: Config, key: jax.Array, state: FleetState | None, env: envs.Env | None, choose: Callable[[Fleet], Any]
+    config: Config, key: jax.Array, state: FleetState | None, env: envs.Env | None, make_step: Callable[[envs.Env], Any]
 ) -> tuple[Any, FleetState]:
-    """Scan over the fleet's step that is chosen; return what it gives [T, ...] and the last state."""
+    """Scan over the steps of a fleet; return what they give [T, ...] and the last state."""
     env = check_run(config, env)
     if state is not None:
         check_state(config, env, state)
     start = prepare(config, key, env) if state is None else state
 
-    step = choose(make_fleet(config, env))
+    step = make_step(env)
     _, key_steps = jax.random.split(key)
 
     def timestep(state: FleetState, _: None) -> tuple[FleetState, Any]:
@@ -152,27 +159,31 @@ def _run(
 
 
 @in_32_bits
-def evaluate(config: Config, key: jax.Array, learner: LearnerState, env: envs.Env | None = None) -> Result:
+def evaluate(config: Config, key: jax.Array, policy: PolicyState, env: envs.Env | None = None) -> Result:
     """Run a trained policy without teleoperation: fresh episodes, hard resets for robots in violation, no updates.
 
     Args:
         config: configuration that the policy was trained with; `num_steps` timesteps are run.
         key: random key.
-        learner: the trained policy, `result.state.learner`.
+        policy: the trained policy, `result.state.policy`.
         env: the environment, if it is not the registered one that the configuration names.
 
     Returns:
         Result: metrics [T] and the last state.
 
     Raises:
-        ValueError: if the configuration is not valid.
+        ValueError: if the configuration is not valid, or the policy does not fit it.
 
     Reference: paper, Appendix (evaluating trained simulation policies).
     """
-    members = jax.tree.leaves(learner.params)[0].shape[0]
-    config = config.replace(algorithm="constraint", ensemble_size=members)
+    members = jax.tree.leaves(policy.params)[0].shape[0]
+    config = without_teleoperation(config).replace(ensemble_size=members)
     env = check_run(config, env)
     key_reset, _ = jax.random.split(key)
     nothing = create_data(env.spec, ensemble_size=members, capacity=1)
-    state = init_state(config, env, key_reset, learner, nothing, {})
-    return run(config, key, state, env)
+    return run(config, key, init(make_parts(config, env), key_reset, policy, nothing, {}), env)
+
+
+def without_teleoperation(config: Config) -> Config:
+    """Return a configuration in which humans only reset robots in violation, and nothing is learnt."""
+    return config.replace(algorithm="constraint")

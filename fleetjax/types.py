@@ -46,7 +46,7 @@ class HumanState(NamedTuple):
 
 
 class Signals(NamedTuple):
-    """What a priority function may look at, for each robot.
+    """What a rule may look at, for each robot.
 
     Attributes:
         violation: bool[N] the constraint indicator c(s).
@@ -54,6 +54,15 @@ class Signals(NamedTuple):
         risk: f32[N] probability of a constraint violation by the safety critic; 0 without one.
         goal: f32[N] probability of success by the goal critic; 0 without one.
         timestep: i32[] timesteps since the fleet started.
+        estimates: f32[N] of each estimator that the algorithm names, by name.
+        obs: f32[N, O] what the robots see.
+        robot_action: f32[N, A] what the robots' policy would do.
+        helped: bool[N] whether a human helped the robot at the last timestep.
+        help_time: i32[N] timesteps of that help so far; 0 without help.
+        correction: f32[N] mean square of the human's action less the robot's where the robot was teleoperated at the last
+            timestep, else 0.
+        human_action: f32[N, A] what the supervisor would do; None unless the algorithm has `sees_supervisor`.
+        link: f32[N] how well each robot can be reached: 1, unless the model of the humans has links.
     """
 
     violation: jax.Array
@@ -61,3 +70,61 @@ class Signals(NamedTuple):
     risk: jax.Array
     goal: jax.Array
     timestep: jax.Array
+    estimates: Any = None
+    obs: Any = None
+    robot_action: Any = None
+    helped: Any = None
+    help_time: Any = None
+    correction: Any = None
+    human_action: Any = None
+    link: Any = None
+
+
+class Plan(NamedTuple):
+    """Who needs whom at this timestep.
+
+    Attributes:
+        signals: Signals[N] that the scores were made from.
+        robot_action: f32[N, A] what the robots' policy would do.
+        score: f32[N] priorities.
+        humans: HumanState[M], the allocation; `duration` counts the timesteps before this one.
+        teleoperated: bool[N] robots that a human teleoperates.
+        resetting: bool[N] robots that a human resets.
+    """
+
+    signals: Signals
+    robot_action: jax.Array
+    score: jax.Array
+    humans: HumanState
+    teleoperated: jax.Array
+    resetting: jax.Array
+
+
+class Interventions(NamedTuple):
+    """Whom each human teleoperates at a timestep, and what came of it; [M], after a run [T, M].
+
+    Attributes:
+        robot: i32 index of the robot, -1 = the human teleoperates nobody, and the rest is of no meaning.
+        priority: f32 the robot's score.
+        step: i32 its control steps since its reset, before this one.
+        obs: f32[O] what the human and the robot's policy saw.
+        robot_action: f32[A] what the policy would have done.
+        human_action: f32[A] what was done.
+        next_obs: f32[O] after it, before any reset or new goal.
+        reward: f32 of that step.
+        violation: bool whether it led to a violation.
+        success: bool whether it completed the task.
+        timeout: bool whether it reached the horizon.
+    """
+
+    robot: jax.Array
+    priority: jax.Array
+    step: jax.Array
+    obs: jax.Array
+    robot_action: jax.Array
+    human_action: jax.Array
+    next_obs: jax.Array
+    reward: jax.Array
+    violation: jax.Array
+    success: jax.Array
+    timeout: jax.Array

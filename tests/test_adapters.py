@@ -23,7 +23,7 @@ FEEDBACK = jnp.array([0.3, 3.0, 0.4, 0.6])  # cart position and pole angle, then
 def balance():
     """Register an analytic supervisor for as long as this module runs."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(supervisors, "_SUPERVISORS", dict(supervisors._SUPERVISORS))
+        patch.setattr(supervisors.SUPERVISORS, "entries", dict(supervisors.SUPERVISORS.entries))
         feedback = fleetjax.Supervisor(lambda state, key: jnp.clip(state.obs @ FEEDBACK, -1.0, 1.0)[None])
         fleetjax.register_supervisor("balance", lambda env: feedback)
         yield feedback

@@ -197,7 +197,8 @@ def toy_supervisors():
 def loop(algorithm: str, num_robots: int, num_humans: int):
     """Return a compiled `(t_T, t_R, falls_at[N], seed) -> Trace` of 40 timesteps."""
     sizes = {"num_robots": num_robots, "num_humans": num_humans, "num_steps": 40, "hidden_sizes": (2,), "ensemble_size": 2}
-    data = {"batch_size": 4, "num_demonstrations": 4, "gradient_steps": 0, "random_threshold": 0.4}
+    data = {"batch_size": 4, "num_demonstrations": 4, "gradient_steps": 0}
+    data |= {"random_threshold": 0.4} if algorithm == "random" else {}
     base = fleetjax.make_config(toy_envs.scripted([0], [0]), algorithm, **sizes, **data)
 
     def run(min_teleop_time, hard_reset_time, falls_at, seed):

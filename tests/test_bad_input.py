@@ -33,8 +33,12 @@ BAD_RUNS = {
     "no goal": (("run", "humanoid", "--algorithm", "thrifty_dagger"), "algorithm = 'thrifty_dagger' needs a goal"),
     "negative uncertainty": ((*RUN, "--uncertainty-threshold", -0.1), "uncertainty_threshold = -0.1"),
     "negative risk": ((*RUN, "--risk-threshold", "-.5"), "risk_threshold = -0.5 must be in [0, 1]"),
-    "negative random": ((*RUN, "--random-threshold", -1), "random_threshold = -1.0 must be in [0, 1]"),
-    "negative thrifty": ((*RUN, "--thrifty-threshold=-1e-3"), "thrifty_threshold = -0.001"),
+    "negative random": ((*RUN, "--algorithm", "random", "--random-threshold", -1), "random_threshold = -1.0 must be in [0, 1]"),
+    "negative thrifty": ((*RUN, "--algorithm", "thrifty_dagger", "--thrifty-threshold=-1e-3"), "thrifty_threshold = -0.001"),
+    "another's parameter": (
+        (*RUN, "--thrifty-weight", 0.5),
+        "thrifty_weight is a parameter of algorithm = 'thrifty_dagger', and not of 'cur'",
+    ),
     "not finite": ((*RUN, "--learning-rate", "inf"), "learning_rate = inf must be at least 0"),
     "no number": ((*RUN, "--learning-rate", "fast"), "--learning-rate: 'fast' must be a number"),
     "batch": ((*RUN, "--batch-size", 600), "batch_size = 600 is larger than the data"),
@@ -110,7 +114,9 @@ def test_numbers_that_a_field_can_hold_are_kept():
 
 
 def test_a_supervisor_whose_actions_have_another_size_is_refused(monkeypatch):
-    monkeypatch.setitem(supervisors._SUPERVISORS, "wide", lambda env: fleetjax.Supervisor(lambda state, key: jnp.zeros(3)))
+    monkeypatch.setitem(
+        supervisors.SUPERVISORS.entries, "wide", lambda env: fleetjax.Supervisor(lambda state, key: jnp.zeros(3))
+    )
     with pytest.raises(ValueError, match=r"'wide' does not fit .*'navigation': it gives \(3,\), and actions have \(2,\)"):
         fleetjax.make_config("navigation", supervisor="wide")
 

@@ -175,8 +175,8 @@ def test_what_the_teacher_shows_is_learnt_from_images():
     pairs = state.human_data.pairs
     assert int(pairs.added) == 3750
     assert pairs.rows.obs.dtype == jnp.uint8
-    learnt = jax.jit(fleetjax.evaluate)(config, jax.random.key(1), state.learner).metrics
-    chance = state.learner._replace(params=jax.tree.map(jnp.zeros_like, state.learner.params))
+    learnt = jax.jit(fleetjax.evaluate)(config, jax.random.key(1), state.policy).metrics
+    chance = state.policy._replace(params=jax.tree.map(jnp.zeros_like, state.policy.params))
     none = jax.jit(fleetjax.evaluate)(config, jax.random.key(1), chance).metrics
     assert int(learnt.successes.sum()) > 24
     assert int(none.successes.sum()) < 12

@@ -52,7 +52,7 @@ def test_chunks_give_the_run_that_the_library_gives(finished):
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5),
         folder.read_policy(run).params,
-        whole.state.learner.params,
+        whole.state.policy.params,
     )
 
 

@@ -1,5 +1,7 @@
 """Nothing that people taught is lost silently, and a run starts only from a state that fits it."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,43 +35,60 @@ def config():
     return fleetjax.make_config("navigation", "uc", **SMALL)
 
 
-@pytest.fixture(scope="module")
-def run():
-    return compiled(fleetjax.run)
+@pytest.fixture(scope="module", autouse=True)
+def toy_supervisors():
+    with toy_envs.registered_supervisors():
+        yield
 
 
 @pytest.fixture(scope="module")
-def full(config, run):
+def safe():
+    """An environment in which nothing happens, so that humans teach at every timestep."""
+    return toy_envs.scripted([0] * 4, [0] * 4, horizon=50)
+
+
+@pytest.fixture(scope="module")
+def safe_config(safe):
+    return fleetjax.make_config(safe, "uc", **SMALL)
+
+
+@pytest.fixture(scope="module")
+def run(safe):
+    return compiled(functools.partial(fleetjax.run, env=safe))
+
+
+@pytest.fixture(scope="module")
+def full(safe_config, run):
     """The result of a run whose humans taught at every timestep; its state has no room left."""
-    result = run(config, KEY)
+    result = run(safe_config, KEY)
     assert int(result.metrics.teleop_steps.sum()) == 60
     assert int(result.metrics.dropped.sum()) == 0
     assert int(result.state.human_data.pairs.added) == 80 == result.state.human_data.pairs.capacity
     return result
 
 
-def test_a_full_state_is_refused_and_extended_it_keeps_all(config, run, full):
+def test_a_full_state_is_refused_and_extended_it_keeps_all(safe, safe_config, run, full):
     with pytest.raises(
         ValueError, match=r"num_steps = 30 can give 60 human pairs.*room for 0 more.*fleetjax\.extend\(state, 60\)"
     ):
-        fleetjax.run(config, KEY, full.state)
+        fleetjax.run(safe_config, KEY, full.state, safe)
     extended = fleetjax.extend(full.state, 60)
     before, after = full.state.human_data, extended.human_data
     kept = jax.tree.map(lambda rows: rows[:80], (after.pairs.rows, after.resample))
     jax.tree.map(np.testing.assert_array_equal, kept, (before.pairs.rows, before.resample))
-    again = run(config, KEY, extended)
+    again = run(safe_config, KEY, extended)
     assert int(again.state.human_data.pairs.added) == 140
     assert int(again.metrics.dropped.sum()) == 0
 
 
-def test_pairs_without_room_are_counted_where_the_state_is_traced(config, run, full):
-    again = run(config, KEY, full.state)
+def test_pairs_without_room_are_counted_where_the_state_is_traced(safe_config, run, full):
+    again = run(safe_config, KEY, full.state)
     assert int(again.state.human_data.pairs.added) == 80
     np.testing.assert_array_equal(again.metrics.dropped, again.metrics.teleop_steps)
     assert int(again.metrics.dropped.sum()) == 60
 
 
-def test_a_run_longer_than_its_state_has_room_for_is_refused_even_when_traced(config, full):
+def test_a_run_longer_than_its_state_has_room_for_is_refused_even_when_traced(config):
     start = jax.eval_shape(lambda: fleetjax.prepare(config, KEY))
     with pytest.raises(ValueError, match=r"num_steps = 50.*room for 80 more.*extend\(state, 20\)"):
         jax.eval_shape(lambda state: fleetjax.run(config.replace(num_steps=50), KEY, state), start)
@@ -128,9 +147,9 @@ def test_extend_takes_several_fleets_and_refuses_nonsense(config):
         ("navigation", "uc", {"num_humans": 3}, "num_humans = 3, and the state was prepared for 2"),
         ("navigation", "uc", {"num_robots": 5}, "num_robots = 5, and the state was prepared for 4"),
         ("block_push", "uc", {}, "environment = 'block_push', and the state was prepared for 'navigation'"),
-        ("navigation", "cur", {}, "algorithm = 'cur' keeps other critics or another memory than 'uc'"),
-        ("navigation", "thrifty_dagger", {}, "algorithm = 'thrifty_dagger' keeps other critics or another memory than 'uc'"),
-        ("navigation", "uc", {"hidden_sizes": (5,)}, r"its \.learner\.params.*float32\[2, 4\], and float32\[2, 5\] is wanted"),
+        ("navigation", "cur", {}, "algorithm = 'cur' keeps other estimators or another memory than 'uc'"),
+        ("navigation", "thrifty_dagger", {}, "algorithm = 'thrifty_dagger' keeps other estimators or another memory than 'uc'"),
+        ("navigation", "uc", {"hidden_sizes": (5,)}, r"its \.policy\.params.*float32\[2, 4\], and float32\[2, 5\] is wanted"),
     ],
 )
 def test_a_state_that_does_not_fit_is_refused_with_both_sides_named(config, environment, algorithm, change, message):
@@ -150,9 +169,8 @@ def test_several_fleets_are_not_taken_for_one(config):
 def test_every_robot_of_the_fleet_is_demonstrated_and_no_other(num_robots):
     """The first number of an observation is the robot; episodes have five steps."""
     env = toy_envs.scripted([0] * num_robots, [0] * num_robots, horizon=5)
-    with toy_envs.registered_supervisors():
-        config = fleetjax.make_config(env, "uc", **SMALL | {"num_robots": num_robots, "num_demonstrations": 5 * num_robots})
-        start = compiled(lambda key: fleetjax.prepare(config, key, env))(KEY)
+    config = fleetjax.make_config(env, "uc", **SMALL | {"num_robots": num_robots, "num_demonstrations": 5 * num_robots})
+    start = compiled(lambda key: fleetjax.prepare(config, key, env))(KEY)
     robots = np.asarray(start.human_data.pairs.rows.obs[: 5 * num_robots, 0])
     np.testing.assert_array_equal(robots, np.repeat(np.arange(num_robots), 5))
 
@@ -161,14 +179,11 @@ def test_critics_see_robots_from_all_along_a_large_fleet(monkeypatch):
     """With four at a time out of ten, and episodes of five steps."""
     monkeypatch.setattr(pretraining, "MOST_LANES", 4)
     env = toy_envs.scripted([0] * 10, [0] * 10, horizon=5)
-    with toy_envs.registered_supervisors():
-        config = fleetjax.make_config(
-            env, "cur", **SMALL | {"num_robots": 10, "num_critic_transitions": 60, "critic_capacity": 60}
-        )
-        learner = imitation.make_learner(config, env.spec)
-        parts = critic.make_critic("safety", config, env.spec, learner)
-        act = lambda state, key: jnp.zeros((4, 1))  # noqa: E731
-        store = compiled(lambda key: pretraining.collect_transitions(config, env, act, parts.append, parts.init(key), key))(KEY)
+    config = fleetjax.make_config(env, "cur", **SMALL | {"num_robots": 10, "num_critic_transitions": 60, "critic_capacity": 60})
+    learner = imitation.make_learner(config, env.spec)
+    parts = critic.make_critic("safety", config, env.spec, learner)
+    act = lambda state, key: jnp.zeros((4, 1))  # noqa: E731
+    store = compiled(lambda key: pretraining.collect_transitions(config, env, act, parts.append, parts.init(key), key))(KEY)
     robots, steps = np.unique(np.asarray(store.negatives.rows.obs[:60, 0]), return_counts=True)
     assert robots.tolist() == list(range(10))
     assert steps.tolist() == [10, 10] + [5] * 8

@@ -1,5 +1,7 @@
 """Derivatives of a run from a given state: every way to ask JAX for them works, and they are finite."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 from compiling import compiled
 
 import fleetjax
-from fleetjax.config import FIELDS
+from fleetjax.config import all_fields, get_value
 
 SMALL = {
     "num_robots": 4,
@@ -27,7 +29,9 @@ SMALL = {
 }
 # Not read once a state is given: it was prepared with them.
 OFFLINE = {"critic_noise"}
-FLOATS = sorted(name for name, field in FIELDS.items() if field.traced and field.kind is float and name not in OFFLINE)
+FLOATS = sorted(
+    name for name, field in all_fields("thrifty_dagger").items() if field.traced and field.kind is float and name not in OFFLINE
+)
 KEY = jax.random.key(1)
 
 
@@ -44,14 +48,14 @@ def kill_a_unit(tree):
 @pytest.fixture(scope="module")
 def fleet():
     """A configuration with all that floats do in a fleet, and a state with dead units and untouched optimizers."""
-    everything = fleetjax.Algorithm(fleetjax.priority.get_algorithm("thrifty_dagger").make_priority, ("safety", "goal"))
+    everything = dataclasses.replace(fleetjax.priority.get_algorithm("thrifty_dagger"), estimators=("safety", "goal"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(fleetjax.priority._ALGORITHMS, "everything", everything)
+        patch.setitem(fleetjax.priority.ALGORITHMS.entries, "everything", everything)
         config = fleetjax.make_config("navigation", "everything", **SMALL)
         state = compiled(fleetjax.prepare)(config, jax.random.key(0))
-        learner = state.learner._replace(params=kill_a_unit(state.learner.params))
-        critics = {kind: store._replace(params=kill_a_unit(store.params)) for kind, store in state.critics.items()}
-        yield config, state._replace(learner=learner, critics=critics)
+        policy = state.policy._replace(params=kill_a_unit(state.policy.params))
+        critics = {kind: store._replace(params=kill_a_unit(store.params)) for kind, store in state.estimators.items()}
+        yield config, state._replace(policy=policy, estimators=critics)
 
 
 @pytest.fixture(scope="module")
@@ -61,11 +65,11 @@ def objective(fleet):
 
     def worth(values: dict[str, jax.Array]) -> jax.Array:
         metrics, last = fleetjax.run(config.replace(**values), KEY, state)
-        learnt = [last.learner.params, [store.params for store in last.critics.values()], last.priority]
-        learnt += [store.target for store in last.critics.values()]
+        learnt = [last.policy.params, [store.params for store in last.estimators.values()], last.priority]
+        learnt += [store.target for store in last.estimators.values()]
         return sum(map(jnp.sum, jax.tree.leaves(learnt)), jnp.sum(metrics.reward) + jnp.sum(metrics.policy_loss))
 
-    return worth, {name: getattr(config, name) for name in FLOATS}
+    return worth, {name: get_value(config, name) for name in FLOATS}
 
 
 def test_derivatives_by_every_float_field_are_finite_forwards_and_in_reverse(objective):

@@ -61,7 +61,7 @@ def test_pairs_are_choices_of_the_teacher(outcome):
 def test_uncertainty_is_the_entropy_of_one_classifier_and_falls(outcome):
     _, _, result = outcome
     uncertainty = np.asarray(result.metrics.uncertainty)
-    assert {leaf.shape[0] for leaf in jax.tree.leaves(result.state.learner.params)} == {1}
+    assert {leaf.shape[0] for leaf in jax.tree.leaves(result.state.policy.params)} == {1}
     assert uncertainty.min() >= 0
     assert uncertainty.max() <= np.log(NUM_CHOICES)
     assert uncertainty[-50:].mean() < 0.5 * uncertainty[:10].mean()
@@ -79,6 +79,6 @@ def test_the_classifier_agrees_with_the_teacher(outcome):
     cells = itertools.product(range(toy_envs.BOARD), repeat=4)
     physics = jnp.array([cell for cell in cells if cell[:2] != cell[2:]])
     states = jax.vmap(lambda p: begin(p, p.astype(jnp.float32) * (2 / (toy_envs.BOARD - 1)) - 1))(physics)
-    robot = imitation.make_learner(config, env.spec).predict(result.state.learner, states.obs)[0]
+    robot = imitation.make_learner(config, env.spec).predict(result.state.policy, states.obs)[0]
     teacher = jax.vmap(toy_envs.teach_grid)(states)
     assert float(jnp.mean(jnp.argmax(robot, axis=1) == jnp.argmax(teacher, axis=1))) > 0.85

@@ -61,8 +61,8 @@ def commands(text: str) -> list[str]:
 @pytest.fixture
 def own_registries(monkeypatch):
     """Let what a page registers vanish after it."""
-    for module, name in ((envs, "_ENVS"), (priority, "_ALGORITHMS"), (supervisors, "_SUPERVISORS")):
-        monkeypatch.setattr(module, name, dict(getattr(module, name)))
+    for registry in (envs.ENVIRONMENTS, priority.ALGORITHMS, supervisors.SUPERVISORS):
+        monkeypatch.setattr(registry, "entries", dict(registry.entries))
 
 
 @pytest.fixture

@@ -15,6 +15,7 @@ from fleetjax import allocation, fleet
 from fleetjax.envs import Env
 from fleetjax.fleet import Fleet, make_fleet
 from fleetjax.learning import critic, imitation
+from fleetjax.priority import base
 from fleetjax.types import HumanState
 
 FALLS_AT = [7, 7, 7, 11, 0, 13]
@@ -40,8 +41,8 @@ def a_reset_one_step_late(patch, config, env):
 
 @fault("cu", "allocation")
 def a_lock_off_by_one(patch, config, env):
-    real = fleet.allocate
-    patch.setattr(fleet, "allocate", lambda score, humans, min_time, *rest: real(score, humans, min_time - 1, *rest))
+    real = base.allocate
+    patch.setattr(base, "allocate", lambda score, humans, min_time, *rest: real(score, humans, min_time - 1, *rest))
     return make_fleet(config, env)
 
 
@@ -58,7 +59,7 @@ def type_judged_before_the_lock(patch, config, env):
 
 @fault("cu", "durations")
 def clock_goes_on_when_the_type_changes(patch, config, env):
-    patch.setattr(fleet, "_restart_clocks", lambda humans, *rest: humans)
+    patch.setattr(fleet, "restart_clocks", lambda humans, *rest: humans)
     return make_fleet(config, env)
 
 
@@ -70,7 +71,7 @@ def ties_broken_by_index(patch, config, env):
 
 @fault("cu", "allocation")
 def free_human_left_assigned(patch, config, env):
-    real = fleet.allocate
+    real = base.allocate
 
     def allocate(score, humans, *rest):
         new = real(score, humans, *rest)
@@ -78,34 +79,34 @@ def free_human_left_assigned(patch, config, env):
         lingers = (new.robot < 0) & (humans.robot >= 0) & ~taken[humans.robot]
         return HumanState(jnp.where(lingers, humans.robot, new.robot), jnp.where(lingers, humans.duration, new.duration))
 
-    patch.setattr(fleet, "allocate", allocate)
+    patch.setattr(base, "allocate", allocate)
     return make_fleet(config, env)
 
 
 @fault("cu", "allocation|durations")
 def human_not_kept_on_its_robot(patch, config, env):
-    real = fleet.allocate
+    real = base.allocate
 
     def allocate(score, humans, min_time, *rest):
         unlocked = humans.duration >= min_time[humans.robot]
         forgetful = HumanState(jnp.where(unlocked, -1, humans.robot), jnp.where(unlocked, 0, humans.duration))
         return real(score, forgetful, min_time, *rest)
 
-    patch.setattr(fleet, "allocate", allocate)
+    patch.setattr(base, "allocate", allocate)
     return make_fleet(config, env)
 
 
 @fault("cu", "allocation")
 def zero_priority_helped(patch, config, env):
-    real = fleet.allocate
-    patch.setattr(fleet, "allocate", lambda score, *rest: real(score + 1e-3, *rest))
+    real = base.allocate
+    patch.setattr(base, "allocate", lambda score, *rest: real(score + 1e-3, *rest))
     return make_fleet(config, env)
 
 
 @fault("cu", "allocation")
 def humans_who_are_not_there_assigned(patch, config, env):
-    real = fleet.allocate
-    patch.setattr(fleet, "allocate", lambda score, humans, min_time, key, available: real(score, humans, min_time, key))
+    real = base.allocate
+    patch.setattr(base, "allocate", lambda score, humans, min_time, key, *rest: real(score, humans, min_time, key))
     return make_fleet(config, env)
 
 

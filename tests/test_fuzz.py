@@ -20,7 +20,7 @@ from reference.recording import quick_jit
 
 import fleetjax
 from fleetjax import cli
-from fleetjax.config import FIELDS, Config, needed_human_capacity
+from fleetjax.config import FIELDS, Config, all_fields, needed_human_capacity
 from fleetjax.io import checkpoint, files, folder, interventions, operation
 
 OF_A_RUN = [name for name in folder.DATA if name != folder.RECORD]  # which consoles alone have
@@ -121,7 +121,7 @@ LARGEST = {  # where a field's own limits allow what takes too long, or more dat
 def draw_settings(config: Config, seed: int) -> Config:
     """Return SETTINGS configurations at once: every traced field at random between its limits, which are drawn now and then."""
     rng, drawn = np.random.default_rng(seed), {}
-    for name, field in FIELDS.items():
+    for name, field in all_fields(config.algorithm).items():
         if field.traced:
             low, high = field.low or 0, LARGEST.get(name, field.high)
             sample = rng.uniform(low, 1 if high is None else high, SETTINGS)
@@ -134,7 +134,9 @@ def draw_settings(config: Config, seed: int) -> Config:
         return config.replace(**values)
 
     kinds = {int: jnp.int32, float: jnp.float32, bool: jnp.bool_}
-    return jax.vmap(replace)({name: jnp.asarray(value, kinds[FIELDS[name].kind]) for name, value in drawn.items()})
+    return jax.vmap(replace)(
+        {name: jnp.asarray(value, kinds[all_fields(config.algorithm)[name].kind]) for name, value in drawn.items()}
+    )
 
 
 @functools.cache

@@ -27,11 +27,13 @@ def _success_shares(config, policies, keys):
 @pytest.mark.slow
 @pytest.mark.statistical
 def test_cur_learns_on_navigation_what_offline_demonstrations_of_equal_cost_teach():
-    """Over five seeds. Same human time and gradient steps for the baseline; shares of episodes that succeed.
+    """Same human time, same gradient steps for the baseline; shares of episodes that succeed, over five seeds.
 
-    Over 20 seeds C.U.R. gained 0.557 on the first clone (deviation 0.050 from seed to seed) and 0.074 on the baseline (0.069).
-    The bars lie five standard errors of five seeds below that, and a little more. So this claims that the fleet learns, and
-    that it does not fall behind the baseline; that it beats it takes more seeds than a test has.
+    Over 20 seeds C.U.R. gained 0.557, 0.544, 0.540 on the first clone (deviations from seed to seed 0.050, 0.059, 0.048) and
+    0.074, 0.067, 0.057 on the baseline (0.069, 0.072, 0.072), with XLA's usual roundings, with `--xla_cpu_max_isa=AVX` and
+    with an empty `--xla_cpu_experimental_ynn_fusion_type`. The bars lie five standard errors of five seeds below the least of
+    them, and some more. So the test claims that the fleet learns from its help, and does not fall behind the baseline; to show
+    that it is better takes more seeds.
     """
     keys = jax.random.split(jax.random.key(0), SEEDS)
     shared = {"num_robots": 20, "num_humans": 2, "ensemble_size": 3, "hard_reset_time": 1, "human_capacity": 10_000}
@@ -42,16 +44,16 @@ def test_cur_learns_on_navigation_what_offline_demonstrations_of_equal_cost_teac
     human_time = [int(result.metrics.human_steps.sum()) for result in results]
 
     # The baseline's gradient steps, `gradient_steps` a timestep more than the online arm's start, are make_config's doing.
-    offline = fleetjax.make_config("navigation", "constraint", extra_demonstrations=0, **shared)
+    offline = fleetjax.make_config("navigation", "constraint_trained", extra_demonstrations=0, **shared)
     assert int(offline.pretraining_steps) == int(online.pretraining_steps) + online.num_steps * online.gradient_steps
     clones = [prepare(offline.replace(extra_demonstrations=t), key).learner for t, key in zip(human_time, keys, strict=True)]
 
-    first = _success_shares(online, [start.learner for start in starts], keys)
-    cur = _success_shares(online, [result.state.learner for result in results], keys)
+    first = _success_shares(online, [start.policy for start in starts], keys)
+    cur = _success_shares(online, [result.state.policy for result in results], keys)
     baseline = _success_shares(online, clones, keys)
     print(f"first clone {first.round(3)}, C.U.R. {cur.round(3)}, constraint {baseline.round(3)}, human time {human_time}")
-    assert np.mean(cur - first) >= 0.4
-    assert np.mean(cur - baseline) >= -0.1
+    assert np.mean(cur - first) >= 0.35
+    assert np.mean(cur - baseline) >= -0.12
 
 
 def test_navigation_teacher_succeeds_in_95_percent_of_episodes():
@@ -78,8 +80,8 @@ def test_safety_critic_foresees_falls_of_the_humanoid(humanoid_fleet):
     num_robots, num_steps, soon = 100, 150, 5
 
     def step(carry, key):
-        action = learner.predict(state.learner, carry.obs)[0]
-        risk = safety.value(state.critics["safety"], state.learner.normalizer, carry.obs, action)
+        action = learner.predict(state.policy, carry.obs)[0]
+        risk = safety.value(state.estimators["safety"], state.policy.normalizer, carry.obs, action)
         after = jax.vmap(env.step)(carry, action, ~carry.violation, jax.random.split(key, num_robots))
         after = tree.where(carry.violation, carry, after)
         return after, (risk, carry.violation)

@@ -93,7 +93,7 @@ def test_fleet_agrees_with_the_oracle_on_navigation(case):
         assert sum(total(seen, name) for seen in outcomes) > 0, name
     for trace in traces:
         assert int(trace.last.human_data.pairs.added) > 0
-        for ring in trace.last.critics.values():
+        for ring in trace.last.estimators.values():
             assert int(ring.negatives.added) > ring.negatives.rows.violation.shape[0]
 
 
@@ -108,7 +108,7 @@ def test_fleet_agrees_with_the_oracle_on_a_scripted_toy(case):
     assert sum(len(outcome.soft_resets) for outcome in seen) > 5
     assert sum(len(outcome.new_goals) for outcome in seen) > 20 or not new_goals
     assert total(seen, "teleop_steps") > 5 or algorithm == "constraint"
-    assert int(trace.last.learner.opt_state.count) == (0 if algorithm == "constraint" else 160)
+    assert int(trace.last.policy.opt_state.count) == (0 if algorithm == "constraint" else 160)
 
 
 def test_oracle_imports_neither_fleetjax_nor_jax():

@@ -30,7 +30,7 @@ def run_navigation():
     envs.make.cache_clear()
     config = fleetjax.make_config("navigation", "cur", **SMALL)
     result = compiled(fleetjax.run)(config, jax.random.key(0))
-    frozen = compiled(fleetjax.evaluate)(config, jax.random.key(1), result.state.learner)
+    frozen = compiled(fleetjax.evaluate)(config, jax.random.key(1), result.state.policy)
     return jax.device_get((result.metrics, frozen.metrics))
 
 

@@ -14,29 +14,30 @@ from reference.recording import quick_jit
 import fleetjax
 from fleetjax import priority
 from fleetjax.config import Config
+from fleetjax.priority import dagger
 from fleetjax.types import Signals
 
 NUM_ROBOTS = 6
 ORDERS = [name for name in fleetjax.list_algorithms() if set(name) <= set("cur")]
-CONFIG = Config().replace(uncertainty_threshold=0.3, risk_threshold=0.5, initial_period=10, thrifty_threshold=0.5)
+CONFIG = Config().replace(uncertainty_threshold=0.3, risk_threshold=0.5, initial_period=10)
 # Few values, so that ties are frequent; thresholds among them.
 levels = st.sampled_from([0.0, 0.1, np.float32(0.3), 0.5, 0.7, 1.0, float("nan")])
 columns = st.lists(levels, min_size=NUM_ROBOTS, max_size=NUM_ROBOTS).map(lambda values: np.array(values, np.float32))
 flags = st.lists(st.booleans(), min_size=NUM_ROBOTS, max_size=NUM_ROBOTS).map(np.array)
 timesteps = st.sampled_from([9, 10])  # the initial period's last, and the next
-all_signals = st.builds(Signals, violation=flags, uncertainty=columns, risk=columns, goal=columns, timestep=timesteps)
+all_signals = st.tuples(flags, columns, columns, columns, timesteps).map(lambda values: Signals(*values))
 
 
 @functools.cache
 def scorer(name: str):
     """Return a compiled `(Signals, aux) -> (score, aux)`."""
-    rule = priority.get_algorithm(name).make_priority(CONFIG)
+    rule = priority.get_algorithm(name).make_priority(CONFIG.replace(algorithm=name))
     return quick_jit(lambda signals, aux: rule.score(signals, aux, jax.random.key(0)))
 
 
 def score(name: str, signals: Signals) -> np.ndarray:
     """Return scores[N] of a first timestep."""
-    aux = priority.get_algorithm(name).make_priority(CONFIG).init()
+    aux = priority.get_algorithm(name).make_priority(CONFIG.replace(algorithm=name)).init()
     return np.asarray(scorer(name)(signals, aux)[0])
 
 
@@ -89,9 +90,9 @@ def test_permuting_robots_permutes_scores(name, signals, data):
 @given(st.lists(columns, min_size=1, max_size=4), columns)
 def test_running_moments_are_those_of_all_values_so_far(batches, other):
     batches = [np.stack([np.nan_to_num(batch), np.nan_to_num(other)], axis=1) for batch in batches]
-    moments = priority.Moments(jnp.zeros(()), jnp.zeros(2), jnp.zeros(2))
+    moments = dagger.Moments(jnp.zeros(()), jnp.zeros(2), jnp.zeros(2))
     for batch in batches:
-        moments = priority.update_moments(moments, jnp.array(batch))
+        moments = dagger.update_moments(moments, jnp.array(batch))
     together = np.concatenate(batches)
     assert int(moments.number) == len(together)
     np.testing.assert_allclose(moments.mean, together.mean(axis=0), rtol=1e-5, atol=1e-6)
@@ -99,7 +100,7 @@ def test_running_moments_are_those_of_all_values_so_far(batches, other):
 
 
 def test_random_scores_are_uniform_and_zero_below_the_threshold():
-    rule = priority.get_algorithm("random").make_priority(CONFIG.replace(random_threshold=0.6))
+    rule = priority.get_algorithm("random").make_priority(CONFIG.replace(algorithm="random", random_threshold=0.6))
     none = jnp.zeros(1000)
     signals = Signals(none.astype(bool), none, none, none, jnp.int32(0))
     scores = np.asarray(rule.score(signals, (), jax.random.key(3))[0])
@@ -116,7 +117,7 @@ def test_an_unknown_algorithm_is_refused_with_the_closest_names():
 
 
 def test_a_registered_priority_is_an_algorithm(monkeypatch):
-    monkeypatch.setattr(priority, "_ALGORITHMS", dict(priority._ALGORITHMS))
+    monkeypatch.setattr(priority.ALGORITHMS, "entries", dict(priority.ALGORITHMS.entries))
 
     def make_least_certain(config):
         def score(signals, aux, key):
@@ -124,10 +125,11 @@ def test_a_registered_priority_is_an_algorithm(monkeypatch):
 
         return fleetjax.Priority(init=lambda: (), score=score)
 
-    fleetjax.register_priority("least_certain", make_least_certain, critics=("goal",))
+    fleetjax.register_priority("least_certain", make_least_certain, estimators=("goal",))
     assert "least_certain" in fleetjax.list_algorithms()
-    assert priority.get_algorithm("least_certain").critics == ("goal",)
+    assert priority.get_algorithm("least_certain").estimators == ("goal",)
     with pytest.raises(ValueError, match="'least_certain' is registered already"):
         fleetjax.register_priority("least_certain", make_least_certain)
-    with pytest.raises(ValueError, match="choose out of 'safety' and 'goal'"):
-        fleetjax.register_priority("other", make_least_certain, critics=("risk",))
+    fleetjax.register_priority("other", make_least_certain, estimators=("risk",))
+    with pytest.raises(ValueError, match="estimator = 'risk' is unknown; the closest are"):
+        jax.eval_shape(fleetjax.run, fleetjax.make_config("navigation", "other"), jax.random.key(0))

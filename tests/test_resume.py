@@ -82,7 +82,7 @@ def test_an_undisturbed_run_is_the_librarys_bit_for_bit(whole):
     run = folder.read_run(whole)
     expected = jax.jit(fleetjax.run)(run.config, jax.random.key(3))
     jax.tree.map(np.testing.assert_array_equal, folder.read_metrics(run), jax.device_get(expected.metrics))
-    jax.tree.map(np.testing.assert_array_equal, folder.read_policy(run).params, expected.state.learner.params)
+    jax.tree.map(np.testing.assert_array_equal, folder.read_policy(run).params, expected.state.policy.params)
     assert np.sum(expected.metrics.hard_resets) > 0
 
 
@@ -475,7 +475,7 @@ def test_a_policy_that_diverges_ends_the_run_and_says_when(stopped, capsys):
     identity, shapes = folder.identity(run.config, 3), operation.execution.shapes(run.config, jax.random.key(3))
     found, _ = checkpoint.restore(stopped, identity, shapes, lambda notes: None)
     assert found is not None
-    learner = found.state.learner
+    learner = found.state.policy
     spoilt = learner._replace(params=jax.tree.map(lambda x: x.at[1].set(np.nan), learner.params))
     writer = checkpoint.Writer(stopped, identity)
     writer.write(found.state._replace(learner=spoilt), found.notes)

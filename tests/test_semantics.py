@@ -36,7 +36,7 @@ def test_semantic_01_order_of_a_timestep(monkeypatch):
     np.testing.assert_allclose(trace.plan.signals.uncertainty[:, 3], seen)  # signals are of theta_t
     np.testing.assert_allclose(trace.metrics.reward, [0, *(1 + 3 * seen[1:])], rtol=1e-6)  # so are actions
     np.testing.assert_allclose(trace.metrics.uncertainty, seen, rtol=1e-6)  # so are metrics
-    assert float(trace.last.learner.params) == pytest.approx(0.11)
+    assert float(trace.last.policy.params) == pytest.approx(0.11)
 
 
 def test_semantic_01_metrics_describe_the_state_before_the_step():
@@ -196,8 +196,8 @@ def test_semantic_08_no_policy_acts_on_a_robot_in_violation():
     trace = play([NOBODY], falls_at=[1, 1, 1, 1])
     assert trace.metrics.moving.tolist() == [4] + [0] * 11
     assert trace.metrics.reward[1:].tolist() == [0] * 11
-    assert int(trace.last.critics["safety"].positives.added) == 4
-    assert int(trace.last.critics["safety"].negatives.added) == 0
+    assert int(trace.last.estimators["safety"].positives.added) == 4
+    assert int(trace.last.estimators["safety"].negatives.added) == 0
 
 
 @pytest.mark.parametrize(
@@ -260,10 +260,10 @@ def test_semantic_10_a_success_counts_once_and_the_episode_goes_on_with_a_new_go
     assert trace.env.episode_return[:9, 0].tolist() == [1, 2, 3, 4, 5, 6, 7, 8, 9]
     assert trace.env.obs[9, 3].tolist() == [3, 0, 0]  # a success on the horizon is counted, then reset
     # The goal critic sees the goal that was reached, before the new one.
-    stored = trace.last.critics["goal"].positives
+    stored = trace.last.estimators["goal"].positives
     assert int(stored.added) == 4
     np.testing.assert_array_equal(stored.rows.next_obs[:4], [[0, 3, 0], [0, 6, 1], [0, 9, 2], [3, 10, 0]])
-    assert int(trace.last.critics["safety"].positives.added) == 0
+    assert int(trace.last.estimators["safety"].positives.added) == 0
 
 
 def test_semantic_11_every_teleoperated_step_gives_a_pair_also_one_that_ends_in_a_violation():

@@ -46,7 +46,7 @@ def last_bias(params):
     return max(params["params"].items())[1]["bias"][:, 0]
 
 
-def constant_policy(learner: imitation.Learner, outputs) -> imitation.LearnerState:
+def constant_policy(learner: imitation.Learner, outputs) -> imitation.PolicyState:
     """Return an ensemble whose members answer `outputs` [E, A] everywhere, before tanh or softmax."""
     state = quick_jit(learner.init)(jax.random.key(0), IDENTITY)
     return state._replace(params=constant(state.params, outputs))
@@ -105,7 +105,7 @@ def test_semantic_12_batches_hold_their_share_of_positives():
 
 def test_semantic_12_critics_store_every_step_of_moving_robots_before_resets():
     trace = play([[1, 0, 0, 0]], falls_at=[NEVER, 2, NEVER, NEVER], succeeds_at=[3, NEVER, NEVER, NEVER])
-    safety, goal = (trace.last.critics[kind] for kind in ("safety", "goal"))
+    safety, goal = (trace.last.estimators[kind] for kind in ("safety", "goal"))
     moves = int(trace.metrics.moving.sum())
     assert moves == 3 * 12 + 2
     for c, positives in ((safety, 1), (goal, 4)):
@@ -121,8 +121,8 @@ def test_semantic_12_critics_store_every_step_of_moving_robots_before_resets():
 
 
 def test_semantic_12_the_goal_critic_is_pretrained_on_the_expert_and_the_safety_critic_on_the_novice(monkeypatch):
-    everything = fleetjax.Algorithm(priority.get_algorithm("cur").make_priority, critics=("safety", "goal"))
-    monkeypatch.setitem(priority._ALGORITHMS, "everything", everything)
+    everything = fleetjax.Algorithm(priority.get_algorithm("cur").make_priority, estimators=("safety", "goal"))
+    monkeypatch.setitem(priority.ALGORITHMS.entries, "everything", everything)
     env = toy_envs.scripted([NEVER, 4, NEVER, NEVER], [3, NEVER, NEVER, NEVER], horizon=6)
     sizes = {
         "num_robots": 4,
@@ -138,12 +138,12 @@ def test_semantic_12_the_goal_critic_is_pretrained_on_the_expert_and_the_safety_
     state = quick_jit(lambda key: fleetjax.prepare(config, key, env))(jax.random.key(0))
     # Twelve steps of each of four robots: one succeeds in every third, one falls in every fourth.
     for kind, positives in (("safety", 3), ("goal", 4)):
-        assert int(state.critics[kind].positives.added) == positives
-        assert int(state.critics[kind].negatives.added) == 48 - positives
+        assert int(state.estimators[kind].positives.added) == positives
+        assert int(state.estimators[kind].negatives.added) == 48 - positives
     learner = imitation.make_learner(config, env.spec)
-    novice, expert = (state.critics[kind].negatives.rows for kind in ("safety", "goal"))
+    novice, expert = (state.estimators[kind].negatives.rows for kind in ("safety", "goal"))
     assert expert.action[:44].tolist() == [[1.0]] * 44
-    np.testing.assert_allclose(novice.action[:45], learner.predict(state.learner, novice.obs[:45])[0], atol=1e-5)
+    np.testing.assert_allclose(novice.action[:45], learner.predict(state.policy, novice.obs[:45])[0], atol=1e-5)
 
 
 def test_semantic_15_uncertainty_is_the_variance_between_members():
@@ -233,4 +233,4 @@ def test_semantic_19_evaluation_resets_at_once_from_the_start_and_learns_nothing
     assert result.metrics.human_steps.tolist() == [0, 0, 1, 1, 1, 0, 0, 1]
     assert result.metrics.teleop_steps.tolist() == [0] * 8
     assert result.metrics.successes.tolist() == [0, 0, 1, 0, 0, 1, 0, 0]  # fresh episodes
-    jax.tree.map(np.testing.assert_array_equal, result.state.learner, learner)
+    jax.tree.map(np.testing.assert_array_equal, result.state.policy, learner)

@@ -88,7 +88,7 @@ def test_semantic_16_orders_are_lexicographic():
 
 
 def test_semantic_17_thrifty_scores_by_hand():
-    config = fleetjax.Config().replace(thrifty_weight=0.25, thrifty_threshold=0.7)
+    config = fleetjax.Config().replace(algorithm="thrifty_dagger", thrifty_weight=0.25, thrifty_threshold=0.7)
     rule = priority.get_algorithm("thrifty_dagger").make_priority(config)
     signals = Signals(jnp.array([True, False]), jnp.array([0.1, 0.3]), jnp.zeros(2), jnp.array([0.5, 0.5]), jnp.int32(0))
     score, moments = rule.score(signals, rule.init(), jax.random.key(0))
@@ -107,14 +107,14 @@ def test_semantic_17_thrifty_scores_by_hand():
 
 @pytest.mark.parametrize(("threshold", "expected"), [(0.75, [0, 0]), (0.74, [0, 1])])
 def test_semantic_17_at_the_threshold_thrifty_is_zero(threshold, expected):
-    config = fleetjax.Config().replace(thrifty_weight=0.25, thrifty_threshold=threshold)
+    config = fleetjax.Config().replace(algorithm="thrifty_dagger", thrifty_weight=0.25, thrifty_threshold=threshold)
     rule = priority.get_algorithm("thrifty_dagger").make_priority(config)
     signals = Signals(jnp.zeros(2, bool), jnp.array([0.0, 1.0]), jnp.zeros(2), jnp.zeros(2), jnp.int32(0))
     assert rule.score(signals, rule.init(), jax.random.key(0))[0].tolist() == expected
 
 
 def test_semantic_17_random_scores_every_robot_violating_or_not():
-    rule = priority.get_algorithm("random").make_priority(fleetjax.Config().replace(random_threshold=0.25))
+    rule = priority.get_algorithm("random").make_priority(fleetjax.Config().replace(algorithm="random", random_threshold=0.25))
     none = jnp.zeros(4)
     signals = Signals(jnp.array([True, False, True, False]), none, none, none, jnp.int32(0))
     key = jax.random.key(5)

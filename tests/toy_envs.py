@@ -121,4 +121,4 @@ def registered_supervisors() -> Iterator[None]:
         yield
     finally:
         for name in teachers:
-            del supervisors._SUPERVISORS[name]
+            del supervisors.SUPERVISORS.entries[name]

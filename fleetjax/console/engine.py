@@ -14,10 +14,10 @@ import numpy as np
 from fleetjax import supervisors
 from fleetjax.config import Config
 from fleetjax.envs import Env
-from fleetjax.fleet import FleetState, Plan, make_fleet
+from fleetjax.fleet import FleetState, make_fleet
 from fleetjax.metrics import Metrics
 from fleetjax.run import prepare
-from fleetjax.types import EnvState
+from fleetjax.types import EnvState, Plan, Signals
 
 EMPTY, PERSON, SIMULATED = 0, 1, 2  # who sits in a seat
 
@@ -154,7 +154,7 @@ class Engine:
         """
         memory, planned = self._programs.plan(self.config, self._key_steps, self.state, seat)
         self.state, self._planned = self.state._replace(priority=memory), planned
-        plan = jax.device_get(planned._replace(robot_action=None))
+        plan = jax.device_get(planned._replace(robot_action=None, signals=Signals(*planned.signals[:5])))
         signals = plan.signals
         seen = (signals.violation, signals.uncertainty, signals.risk, signals.goal, plan.score)
         return View(self.timestep, plan.humans.robot, plan.humans.duration, plan.resetting, *seen)
@@ -177,7 +177,7 @@ class Engine:
 
 def _split(state: FleetState) -> tuple[Any, FleetState]:
     """Return what is large, whose memory a step takes over, and the rest."""
-    return (state.human_data, state.critics), state._replace(human_data=None, critics=None)
+    return (state.human_data, state.estimators), state._replace(human_data=None, estimators=None)
 
 
 def _halves(config: Config, env: Env) -> tuple[Any, Any]:
@@ -195,7 +195,7 @@ def _halves(config: Config, env: Env) -> tuple[Any, Any]:
     def advance(
         config: Config, key_steps: jax.Array, store: Any, rest: FleetState, plan: Plan, inputs: Inputs
     ) -> tuple[FleetState, Metrics]:
-        state = rest._replace(human_data=store[0], critics=store[1])
+        state = rest._replace(human_data=store[0], estimators=store[1])
         _, key_human, key_advance = keys(key_steps, state)
         action = jax.vmap(supervisor.act)(state.env, jax.random.split(key_human, num_robots))
         simulated = jnp.asarray(inputs.seat) == SIMULATED

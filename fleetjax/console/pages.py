@@ -99,13 +99,13 @@ def operator(session: Session, view: View, number: int, seat: Seat, pictures: Ma
 def _signals(session: Session, view: View, robot: int) -> list[dict[str, Any]]:
     """Return a robot's signals beside their thresholds."""
     config = session.config
-    critics = get_algorithm(config.algorithm).critics
+    estimators = get_algorithm(config.algorithm).estimators
     rows: list[tuple[str, float, float | None]] = [
         ("uncertainty", float(view.uncertainty[robot]), float(config.uncertainty_threshold))
     ]
-    if "safety" in critics:
+    if "safety" in estimators:
         rows.append(("risk", float(view.risk[robot]), float(config.risk_threshold)))
-    if "goal" in critics:
+    if "goal" in estimators:
         rows.append(("chance of success", float(view.goal[robot]), None))
     return [{"name": name, "value": value, "threshold": threshold} for name, value, threshold in rows]
 

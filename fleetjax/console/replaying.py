@@ -70,7 +70,7 @@ def replay(run: folder.Run, rows: np.ndarray) -> Metrics:
                 show(chunks[-1])
         names = compared(config)
         if folder.POLICY in names:
-            folder.write_policy(Path(temporary), engine.state.learner)
+            folder.write_policy(Path(temporary), engine.state.policy)
         for name in names:
             if (Path(temporary) / name).read_bytes() != (run.folder / name).read_bytes():
                 raise Disagreement(f"{run.folder}: {name} is not what the replay gives (another machine, or other versions?)")

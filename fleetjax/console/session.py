@@ -82,7 +82,7 @@ class Session:
         for log in self._logs:
             log.mark()
         if get_algorithm(self.config.algorithm).pretrains:
-            folder.write_policy(self.run.folder, self.engine.state.learner)
+            folder.write_policy(self.run.folder, self.engine.state.policy)
         return execution.join(self.metrics)
 
     def close(self) -> None:

@@ -9,6 +9,7 @@ import jax
 
 from fleetjax.envs.adapters import from_brax, from_playground
 from fleetjax.envs.base import Env, EnvSpec, Scene, begin, proceed
+from fleetjax.registry import Registry
 
 __all__ = [
     "Env",
@@ -56,7 +57,7 @@ def _pure(name: str) -> Callable[[str], Env]:
     return make_env
 
 
-_ENVS: dict[str, _Entry] = {
+_SHIPPED: dict[str, _Entry] = {
     "humanoid": _Entry(
         _robot("humanoid"), {"uncertainty_threshold": 0.05, "random_threshold": 0.99807, "initial_period": 1000}
     ),
@@ -101,38 +102,37 @@ _ENVS: dict[str, _Entry] = {
 }
 
 
+ENVIRONMENTS: Registry[_Entry] = Registry("environment")
+for _name, _entry in _SHIPPED.items():
+    ENVIRONMENTS.register(_name, _entry)
+
+
 def register_env(name: str, make_env: Callable[[str], Env], *, defaults: Mapping[str, Any] | None = None) -> None:
     """Make an environment available to `make_config` under `name`.
 
     Args:
         name: what users call it.
         make_env: `backend -> Env`; called once for each backend.
-        defaults: `Config` fields whose default it changes.
+        defaults: `Config` fields, and algorithms' own parameters, whose default it changes.
 
     Raises:
         ValueError: if the name is taken.
     """
-    if name in _ENVS:
-        raise ValueError(f"environment = {name!r} is registered already; choose another name")
-    _ENVS[name] = _Entry(make_env, dict(defaults or {}))
+    ENVIRONMENTS.register(name, _Entry(make_env, dict(defaults or {})))
 
 
 def list_envs() -> tuple[str, ...]:
     """Return the registered names."""
-    return tuple(_ENVS)
+    return ENVIRONMENTS.names()
 
 
 def get_defaults(name: str) -> Mapping[str, Any]:
-    """Return the `Config` defaults that an environment changes.
+    """Return the defaults that an environment changes.
 
     Raises:
         ValueError: if there is none of that name; the message has the closest ones.
     """
-    if name not in _ENVS:
-        from fleetjax.priority import unknown
-
-        raise ValueError(unknown("environment", name, _ENVS))
-    return _ENVS[name].defaults
+    return ENVIRONMENTS.get(name).defaults
 
 
 @functools.cache
@@ -146,6 +146,6 @@ def make(name: str, backend: str = "auto") -> Env:
     Raises:
         ValueError: if a name is unknown.
     """
-    get_defaults(name)
+    make_env = ENVIRONMENTS.get(name).make_env
     with jax.ensure_compile_time_eval(), jax.enable_x64(False):  # constants must outlive the trace that may be running
-        return _ENVS[name].make_env(backend)
+        return make_env(backend)

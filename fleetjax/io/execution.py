@@ -9,9 +9,9 @@ import numpy as np
 
 from fleetjax.config import Config
 from fleetjax.fleet import FleetState, Interventions
-from fleetjax.learning.imitation import LearnerState
+from fleetjax.learning.imitation import PolicyState
 from fleetjax.metrics import Metrics
-from fleetjax.run import evaluate, prepare, run, run_logged
+from fleetjax.run import evaluate, prepare, run, run_logged, without_teleoperation
 
 CHUNKS = 100  # that a run is divided into, more or less
 
@@ -113,7 +113,7 @@ def go_on(
         yield jax.device_get(chunk), state
 
 
-def start_evaluation(config: Config, key: jax.Array, learner: LearnerState) -> Iterator[Metrics]:
+def start_evaluation(config: Config, key: jax.Array, learner: PolicyState) -> Iterator[Metrics]:
     """Compile the evaluation of a trained policy, and return what runs it, chunk after chunk.
 
     Returns:
@@ -122,7 +122,7 @@ def start_evaluation(config: Config, key: jax.Array, learner: LearnerState) -> I
     length, *others = chunks_of(config.num_steps, chunk_length(config.num_steps))
     first = config.replace(num_steps=length)
     begin = jax.jit(evaluate).lower(first, key, learner).compile()
-    config = config.replace(algorithm="constraint")  # nobody teleoperates
+    config = without_teleoperation(config)
     if others:
         _ADVANCE[False].lower(config.replace(num_steps=others[0]), key, begin.out_info.state).compile()
 

@@ -14,7 +14,7 @@ import numpy as np
 from fleetjax.config import Config
 from fleetjax.envs import EnvSpec
 from fleetjax.io import files, folder
-from fleetjax.priority import unknown
+from fleetjax.registry import unknown
 from fleetjax.version import VERSION
 
 NEEDS = {"lerobot": ("pyarrow",), "robomimic": ("h5py",), "minari": ("minari", "gymnasium", "h5py")}

@@ -9,10 +9,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NoReturn
 
-from fleetjax.config import FIELDS, Config, Field
+from fleetjax.config import FIELDS, every_field, owners
 from fleetjax.envs import get_defaults, list_envs
+from fleetjax.field import Field
 from fleetjax.io.export import FORMATS
-from fleetjax.priority import unknown
+from fleetjax.registry import unknown
 from fleetjax.version import VERSION
 
 _LARGEST_SEED = 2**32 - 1  # JAX folds larger ones onto these
@@ -31,8 +32,8 @@ _RUN_ABOUT = """\
 Clone demonstrations, then run the fleet while it learns from those who help it. Ends with a table, and a run folder that
 holds config.json, metrics.csv (a row a timestep), figure.png, policy.msgpack and the last two checkpoints."""
 _RUN_NOTE = """\
-Two algorithms have defaults of their own: expert has as many humans as robots; constraint has as many gradient steps before
-the start as others have in all, and the human time of C.U.R. as extra demonstrations. `fleetjax list` explains them."""
+Some algorithms have defaults of their own: expert has as many humans as robots; constraint has the human time of C.U.R. as
+extra demonstrations, and constraint_trained has, besides, as many gradient steps before the start as others have in all."""
 
 
 class Refusal(Exception):
@@ -193,11 +194,14 @@ def _add_console(commands: Any, environment: str | None) -> None:
 
 
 def _add_parameters(command: Any, environment: str | None, short: Mapping[str, str] = MappingProxyType({})) -> None:
-    """Add a flag for each field of `Config`, with a short form for some."""
-    parameters = command.add_argument_group(f"parameters{f' (defaults of {environment})' if environment else ''}")
-    for name, field in FIELDS.items():
-        if name != "environment":
-            _add_field(parameters, name, field, environment, *([short[name]] if name in short else []))
+    """Add a flag for each field of `Config`, with a short form for some, and for each parameter of an algorithm."""
+    fields = command.add_argument_group(f"parameters{f' (defaults of {environment})' if environment else ''}")
+    own = command.add_argument_group("parameters of one algorithm, refused with another")
+    for name, field in every_field().items():
+        if name in FIELDS and name != "environment":
+            _add_field(fields, name, field, environment, *([short[name]] if name in short else []))
+        elif name not in FIELDS:
+            _add_field(own, name, field._replace(help=f"{', '.join(owners(name))}: {field.help}"), environment)
 
 
 def _add_field(group: Any, name: str, field: Field, environment: str | None, *short: str) -> None:
@@ -210,12 +214,12 @@ def _add_field(group: Any, name: str, field: Field, environment: str | None, *sh
     else:
         kinds = {str: (str, "NAME"), int: (_integer, "N"), float: (_number, "X")}
         options["type"], options["metavar"] = kinds[field.kind]
-    text = f"{field.help}{unit} [default: {_default(name, environment)}]".replace("%", "%%")
+    text = f"{field.help}{unit} [default: {_default(name, field, environment)}]".replace("%", "%%")
     group.add_argument(f"--{name.replace('_', '-')}", *short, help=text, **options)
 
 
-def _default(name: str, environment: str | None) -> str:
-    general = getattr(Config, name)
+def _default(name: str, field: Field, environment: str | None) -> str:
+    general = field.default
     if environment:
         return show(get_defaults(environment).get(name, general))
     changed = {env: get_defaults(env)[name] for env in list_envs() if get_defaults(env).get(name, general) != general}

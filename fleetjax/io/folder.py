@@ -24,9 +24,9 @@ from flax import serialization
 
 from fleetjax import envs
 from fleetjax.checks import state_shapes
-from fleetjax.config import FIELDS, Config, validate
+from fleetjax.config import Config, all_fields, get_value, validate
 from fleetjax.io import checkpoint, files, interventions
-from fleetjax.learning.imitation import LearnerState
+from fleetjax.learning.imitation import PolicyState
 from fleetjax.metrics import Metrics
 from fleetjax.priority import get_algorithm
 from fleetjax.version import VERSION
@@ -174,15 +174,14 @@ def with_digest(content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def to_plain(config: Config) -> dict[str, Any]:
-    """Return the fields as plain Python values; the shortest decimal that stands for each f32."""
+    """Return fields and parameters as plain Python values; the shortest decimal that stands for each f32."""
 
-    def plain(name: str, value: Any) -> Any:
-        kind = FIELDS[name].kind
+    def plain(value: Any, kind: type) -> Any:
         if kind is tuple:
             return list(value)
         return float(str(np.float32(value))) if kind is float else kind(value)
 
-    return {name: plain(name, getattr(config, name)) for name in FIELDS}
+    return {name: plain(get_value(config, name), field.kind) for name, field in all_fields(config.algorithm).items()}
 
 
 def identity(config: Config, seed: int) -> dict[str, Any]:
@@ -206,12 +205,12 @@ def append_metrics(log: files.Log, metrics: Metrics, first: int) -> None:
     log.append(rows.getvalue().encode())
 
 
-def write_policy(folder: Path, learner: LearnerState) -> None:
+def write_policy(folder: Path, learner: PolicyState) -> None:
     """Write `policy.msgpack`: the ensemble's parameters [E, ...] and the normalizer, by flax's serialization."""
     files.write(folder / POLICY, serialization.to_bytes(_policy(learner)))
 
 
-def _policy(learner: LearnerState) -> dict[str, Any]:
+def _policy(learner: PolicyState) -> dict[str, Any]:
     return {"params": learner.params, "normalizer": learner.normalizer}
 
 
@@ -277,11 +276,12 @@ def read_finished(run: Run) -> Metrics | None:
 
 
 def _from_plain(fields: Mapping[str, Any]) -> Config:
-    for problem, names in (("unknown", set(fields) - set(FIELDS)), ("missing", set(FIELDS) - set(fields))):
+    known = all_fields(fields.get("algorithm", ""))
+    for problem, names in (("unknown", set(fields) - set(known)), ("missing", set(known) - set(fields))):
         _expect(not names, f"{problem} fields: {', '.join(sorted(names))} (another version of fleetjax?)")
     for name, value in fields.items():
-        _expect(_fits(value, FIELDS[name].kind), f"{name} = {value!r} must be of type {FIELDS[name].kind.__name__}")
-    config = Config().replace(**fields | {"human_capacity": 0})
+        _expect(_fits(value, known[name].kind), f"{name} = {value!r} must be of type {known[name].kind.__name__}")
+    config = Config().replace(**{**fields, "human_capacity": 0})
     if fields["human_capacity"] not in (0, config.human_capacity):  # it was asked for, and does not follow from the others
         config = config.replace(human_capacity=fields["human_capacity"])
     validate(config)
@@ -368,7 +368,7 @@ def read_interventions(run: Run) -> list[np.ndarray]:
         return interventions.split(interventions.parse(_read_data(run, interventions.FILE), spec))
 
 
-def read_policy(run: Run) -> LearnerState:
+def read_policy(run: Run) -> PolicyState:
     """Read the trained policy of a run.
 
     Raises:

@@ -123,7 +123,7 @@ def operate(run: folder.Run, *, resume: bool, checkpoint_every: int, save: Calla
         raise
     metrics = execution.join(gathered)
     if get_algorithm(run.config.algorithm).pretrains:
-        folder.write_policy(run.folder, state.learner)
+        folder.write_policy(run.folder, state.policy)
     save(run, metrics)
     return metrics
 

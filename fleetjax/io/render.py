@@ -17,8 +17,8 @@ from fleetjax import envs
 from fleetjax.allocation import helper_of
 from fleetjax.config import Config
 from fleetjax.fleet import FleetState, make_fleet
-from fleetjax.learning.imitation import LearnerState
-from fleetjax.run import evaluate, prepare, run
+from fleetjax.learning.imitation import PolicyState
+from fleetjax.run import evaluate, prepare, run, without_teleoperation
 from fleetjax.types import EnvState
 
 FORMATS = (".gif", ".mp4")
@@ -69,7 +69,7 @@ def check(config: Config) -> None:
         check_gl()
 
 
-def start(config: Config, key: jax.Array, learner: LearnerState | None, *, skip: int) -> tuple[Config, FleetState]:
+def start(config: Config, key: jax.Array, learner: PolicyState | None, *, skip: int) -> tuple[Config, FleetState]:
     """Return the state in which a film begins, and the configuration to go on with.
 
     Args:
@@ -80,7 +80,7 @@ def start(config: Config, key: jax.Array, learner: LearnerState | None, *, skip:
     """
     if learner is not None:
         state = jax.jit(evaluate)(config.replace(num_steps=max(1, skip)), key, learner).state
-        return config.replace(algorithm="constraint"), state
+        return without_teleoperation(config), state
     state = jax.jit(prepare)(config, key)
     return config, jax.jit(run)(config.replace(num_steps=skip), key, state).state if skip else state
 

@@ -11,6 +11,10 @@ from fleetjax.priority import get_algorithm
 # What the paper calls an algorithm, and what it does.
 _KNOWN = {
     "constraint": ("Constraint", "the first clone, never updated; humans only reset robots in violation (the paper's BC)"),
+    "constraint_trained": (
+        "Constraint, trained out",
+        "the same, with as many gradient steps before the start as others take in all",
+    ),
     "random": ("Random", "random robots get help, as much as random_threshold lets through"),
     "ensemble_dagger": ("Fleet-EnsembleDAgger", "U.C.: uncertain robots first, then robots in violation"),
     "thrifty_dagger": (

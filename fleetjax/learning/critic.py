@@ -3,6 +3,7 @@
 Reference: paper, Section 4.2 and Appendix (training critic Q-functions).
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -12,7 +13,7 @@ import optax
 from fleetjax.config import Config
 from fleetjax.envs import EnvSpec
 from fleetjax.learning import buffer
-from fleetjax.learning.imitation import Learner, LearnerState, stored_obs
+from fleetjax.learning.imitation import Learner, PolicyState, stored_obs
 from fleetjax.learning.networks import ADAM, Normalizer, descend, make_network
 from fleetjax.tree import take, where
 
@@ -55,13 +56,13 @@ class Critic(NamedTuple):
         value: `(CriticState, Normalizer, obs f32[..., O], action f32[..., A]) -> f32[...]`, the pessimistic twin:
             the larger for risk, the smaller for the goal.
         append: `(CriticState, Transition[K], mask bool[K]) -> CriticState`.
-        update: `(CriticState, Learner state, key) -> CriticState`, one gradient step.
+        update: `(CriticState, PolicyState, key) -> CriticState`, one gradient step.
     """
 
-    init: Any
-    value: Any
-    append: Any
-    update: Any
+    init: Callable[[jax.Array], CriticState]
+    value: Callable[[CriticState, Normalizer, jax.Array, jax.Array], jax.Array]
+    append: Callable[[CriticState, Transition, jax.Array], CriticState]
+    update: Callable[[CriticState, PolicyState, jax.Array], CriticState]
 
 
 def make_critic(kind: str, config: Config, spec: EnvSpec, learner: Learner) -> Critic:
@@ -118,7 +119,7 @@ def make_critic(kind: str, config: Config, spec: EnvSpec, learner: Learner) -> C
         batch = where(positive, draw(key_positive, state.positives), draw(key_negative, state.negatives))
         return batch, jnp.where(positive, state.positives.size, state.negatives.size) > 0
 
-    def update(state: CriticState, policy: LearnerState, key: jax.Array) -> CriticState:
+    def update(state: CriticState, policy: PolicyState, key: jax.Array) -> CriticState:
         batch, valid = sample(state, key)
         next_action, _ = learner.predict(policy, batch.next_obs)
         next_value = twins(state.target, policy.normalizer, batch.next_obs, next_action)
@@ -135,3 +136,17 @@ def make_critic(kind: str, config: Config, spec: EnvSpec, learner: Learner) -> C
         return state._replace(params=params, target=slow, opt_state=opt_state)
 
     return Critic(init, value, append, update)
+
+
+def train(critic: Critic, state: CriticState, policy: PolicyState, steps: jax.Array | int, key: jax.Array) -> CriticState:
+    """Take gradient steps; the rings stay out of the loop's carry, which a sweep would copy at each turn."""
+    rings = {"positives": state.positives, "negatives": state.negatives}
+
+    def body(i, nets):
+        params, target, opt_state = nets
+        before = CriticState(params, target, opt_state, **rings)
+        after = critic.update(before, policy, jax.random.fold_in(key, i))
+        return after.params, after.target, after.opt_state
+
+    nets = jax.lax.fori_loop(0, steps, body, (state.params, state.target, state.opt_state))
+    return CriticState(*nets, **rings)

@@ -5,6 +5,7 @@ actions: one classifier; uncertainty is its entropy.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -40,7 +41,7 @@ class HumanData(NamedTuple):
     dropped: jax.Array
 
 
-class LearnerState(NamedTuple):
+class PolicyState(NamedTuple):
     """Parameters [E, ...] and optimizer state of the ensemble, and the normalizer of observations."""
 
     params: Any
@@ -48,10 +49,15 @@ class LearnerState(NamedTuple):
     normalizer: Normalizer
 
 
+def num_members(spec: EnvSpec, ensemble_size: int) -> int:
+    """Return how many networks the policy has: one classifier where actions are discrete."""
+    return 1 if spec.discrete else ensemble_size
+
+
 def create_data(spec: EnvSpec, *, ensemble_size: int, capacity: int) -> HumanData:
     """Return an empty data set."""
     example = Pair(stored_obs(spec), jnp.zeros(spec.action_size))
-    resample = jnp.zeros((capacity, ensemble_size), jnp.int32)
+    resample = jnp.zeros((capacity, num_members(spec, ensemble_size)), jnp.int32)
     return HumanData(buffer.create(example, capacity), resample, jnp.zeros((), jnp.int32))
 
 
@@ -99,34 +105,34 @@ class Learner(NamedTuple):
     """Pure functions of the ensemble.
 
     Attributes:
-        init: `(key, Normalizer) -> LearnerState`.
-        predict: `(LearnerState, obs f32[..., O]) -> (action f32[..., A], uncertainty f32[...])`; the uncertainty lies in
+        init: `(key, Normalizer) -> PolicyState`.
+        predict: `(PolicyState, obs f32[..., O]) -> (action f32[..., A], uncertainty f32[...])`; the uncertainty lies in
             [0, 1] (discrete: entropy in nats).
-        update: `(LearnerState, HumanData, key) -> (LearnerState, loss f32[])`, one gradient step.
+        update: `(PolicyState, HumanData, key) -> (PolicyState, loss f32[])`, one gradient step.
         append: `(HumanData, Pair[K], mask bool[K], key) -> HumanData` adds pairs, in `augmented_copies` if so configured.
     """
 
-    init: Any
-    predict: Any
-    update: Any
-    append: Any = append
+    init: Callable[[jax.Array, Normalizer], PolicyState]
+    predict: Callable[[PolicyState, jax.Array], tuple[jax.Array, jax.Array]]
+    update: Callable[[PolicyState, HumanData, jax.Array], tuple[PolicyState, jax.Array]]
+    append: Callable[[HumanData, Pair, jax.Array, jax.Array], HumanData] = append
 
 
 def make_learner(config: Config, spec: EnvSpec) -> Learner:
     """Build the ensemble for a configuration and an environment."""
-    members = 1 if spec.discrete else config.ensemble_size
+    members = num_members(spec, config.ensemble_size)
     network = make_network(spec, config.hidden_sizes, spec.action_size)
 
-    def init(key: jax.Array, normalizer: Normalizer) -> LearnerState:
+    def init(key: jax.Array, normalizer: Normalizer) -> PolicyState:
         params = jax.vmap(lambda k: network.init(k, normalizer.mean))(jax.random.split(key, members))
-        return LearnerState(params, ADAM.init(params), normalizer)
+        return PolicyState(params, ADAM.init(params), normalizer)
 
     def outputs(params: Any, obs: jax.Array) -> jax.Array:
         """f32[E, ..., A] actions, or logits of the classifier; `obs` is normalised."""
         raw = jax.vmap(network.apply, in_axes=(0, None))(params, obs)
         return raw if spec.discrete else jnp.tanh(raw)
 
-    def predict(state: LearnerState, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def predict(state: PolicyState, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
         answers = outputs(state.params, state.normalizer(obs))
         if spec.discrete:
             log_p = jax.nn.log_softmax(answers[0])
@@ -139,7 +145,7 @@ def make_learner(config: Config, spec: EnvSpec) -> Learner:
             return jnp.mean(optax.softmax_cross_entropy(answer, action))
         return jnp.mean((jnp.tanh(answer) - action) ** 2)
 
-    def update(state: LearnerState, data: HumanData, key: jax.Array) -> tuple[LearnerState, jax.Array]:
+    def update(state: PolicyState, data: HumanData, key: jax.Array) -> tuple[PolicyState, jax.Array]:
         draw = buffer.draw_index(key, (members, config.batch_size), data.pairs.size)
         index = data.resample[draw, jnp.arange(members)[:, None]]
         batch = take(data.pairs.rows, index)

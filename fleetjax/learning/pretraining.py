@@ -3,11 +3,12 @@
 import jax
 import jax.numpy as jnp
 
-from fleetjax import priority, supervisors, tree
+from fleetjax import priority, supervisors
 from fleetjax.config import Config
 from fleetjax.envs import Env
 from fleetjax.learning import critic, imitation
 from fleetjax.learning.networks import fit_normalizer, pixel_normalizer
+from fleetjax.tree import where
 from fleetjax.types import EnvState
 
 LANES = 8  # episodes that are demonstrated side by side
@@ -38,8 +39,8 @@ def collect_demonstrations(
         ended = after.violation | after.timeout | (after.success & (env.next_goal is None))
         if env.next_goal:
             renewed = jax.vmap(env.next_goal)(after, jax.random.split(key_goal, LANES))
-            after = tree.where(after.success, renewed, after)
-        return (tree.where(running, after, state), running & ~ended), (pair, running)
+            after = where(after.success, renewed, after)
+        return (where(running, after, state), running & ~ended), (pair, running)
 
     def episodes(carry: tuple[imitation.HumanData, jax.Array]):
         data, count = carry
@@ -89,7 +90,7 @@ def collect_transitions(config: Config, env: Env, act, add, store: critic.Critic
         ended = after.violation | after.timeout | after.success
         robots = jnp.where(ended, (robots + num_lanes) % config.num_robots, robots)
         fresh = jax.vmap(env.reset)(jax.random.split(key_reset, num_lanes), robots)
-        return (tree.where(ended, fresh, after), store, count + num_lanes, robots), None
+        return (where(ended, fresh, after), store, count + num_lanes, robots), None
 
     def burst(carry):
         keys = jax.random.split(jax.random.fold_in(key_bursts, carry[2]), BURST)
@@ -106,62 +107,27 @@ def disturb(config: Config, env: Env, action: jax.Array, key: jax.Array) -> jax.
         return jnp.clip(action + config.critic_noise * jax.random.normal(key, action.shape), -1.0, 1.0)
     key_whether, key_what = jax.random.split(key)
     other = jax.nn.one_hot(jax.random.randint(key_what, action.shape[:1], 0, action.shape[1]), action.shape[1])
-    return tree.where(jax.random.uniform(key_whether, action.shape[:1]) < config.critic_noise, other, action)
+    return where(jax.random.uniform(key_whether, action.shape[:1]) < config.critic_noise, other, action)
 
 
 def pretrain(
-    config: Config, env: Env, key: jax.Array
-) -> tuple[imitation.LearnerState, imitation.HumanData, dict[str, critic.CriticState]]:
-    """Return the policy, data and critics that the fleet starts with.
+    config: Config, env: Env, learner: imitation.Learner, supervisor: supervisors.Supervisor, key: jax.Array
+) -> tuple[imitation.PolicyState, imitation.HumanData]:
+    """Return the policy and the data that the fleet starts with.
 
-    The safety critic learns from the first clone's transitions, the goal critic from the supervisor's; both after
-    the policy, whose actions their targets use.
-
-    Reference: paper, Section 5.2 and Appendix (training critic Q-functions).
+    Reference: paper, Section 5.2.
     """
-    key_demos, key_init, key_policy, key_critics = jax.random.split(key, 4)
-    algorithm = priority.get_algorithm(config.algorithm)
-    supervisor = supervisors.make(config.supervisor or env.spec.supervisor, env)
-    learner = imitation.make_learner(config, env.spec)
-    members = 1 if env.spec.discrete else config.ensemble_size
-
-    data = imitation.create_data(env.spec, ensemble_size=members, capacity=config.human_capacity)
-    if algorithm.pretrains:
+    key_demos, key_init, key_policy = jax.random.split(key, 3)
+    pretrains = priority.get_algorithm(config.algorithm).pretrains
+    data = imitation.create_data(env.spec, ensemble_size=config.ensemble_size, capacity=config.human_capacity)
+    if pretrains:
         data = collect_demonstrations(config, env, supervisor, learner.append, data, key_demos)
     if env.spec.image_shape:
         normalizer = pixel_normalizer(env.spec.observation_size)
     else:
         normalizer = fit_normalizer(data.pairs.rows.obs, data.pairs.size, enabled=config.normalize_observations)
     policy = learner.init(key_init, normalizer)
-    if algorithm.pretrains:
+    if pretrains:
         keys = lambda i: jax.random.fold_in(key_policy, i)  # noqa: E731
         policy = jax.lax.fori_loop(0, config.pretraining_steps, lambda i, p: learner.update(p, data, keys(i))[0], policy)
-
-    states = {}
-    for kind in algorithm.critics:
-        key_critics, key_net, key_data, key_train = jax.random.split(key_critics, 4)
-        parts = critic.make_critic(kind, config, env.spec, learner)
-
-        def act(state: EnvState, key: jax.Array, kind: str = kind) -> jax.Array:
-            if kind == "safety":
-                return learner.predict(policy, state.obs)[0]
-            return jax.vmap(supervisor.act)(state, jax.random.split(key, state.obs.shape[0]))
-
-        full = collect_transitions(config, env, act, parts.append, parts.init(key_net), key_data)
-        steps = config.critic_pretraining_steps
-        states[kind] = _train_critic(parts, full, policy, steps, key_train)
-    return policy, data, states
-
-
-def _train_critic(parts: critic.Critic, state: critic.CriticState, policy, steps: jax.Array | int, key: jax.Array):
-    """Take gradient steps; the rings stay out of the loop's carry, which a sweep would copy at each turn."""
-    rings = {"positives": state.positives, "negatives": state.negatives}
-
-    def body(i, nets):
-        params, target, opt_state = nets
-        before = critic.CriticState(params, target, opt_state, **rings)
-        after = parts.update(before, policy, jax.random.fold_in(key, i))
-        return after.params, after.target, after.opt_state
-
-    nets = jax.lax.fori_loop(0, steps, body, (state.params, state.target, state.opt_state))
-    return critic.CriticState(*nets, **rings)
+    return policy, data

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from fleetjax.envs.base import Env
 from fleetjax.precision import in_32_bits
+from fleetjax.registry import Registry
 from fleetjax.supervisors import expert
 from fleetjax.types import EnvState
 
@@ -51,13 +52,18 @@ def _allegro_hand(env: Env) -> Supervisor:
     return _shipped("allegro_hand", allegro_hand.view)(env)
 
 
-_SUPERVISORS: dict[str, Callable[[Env], Supervisor]] = {
+SUPERVISORS: Registry[Callable[[Env], Supervisor]] = Registry("supervisor")
+_SHIPPED: dict[str, Callable[[Env], Supervisor]] = {
     "humanoid": _shipped("humanoid"),
     "anymal": _shipped("anymal"),
     "allegro_hand": _allegro_hand,
     "block_push": _block_push,
     "navigation": _navigation,
 }
+
+
+for _name, _make in _SHIPPED.items():
+    SUPERVISORS.register(_name, _make)
 
 
 def register_supervisor(name: str, make_supervisor: Callable[[Env], Supervisor]) -> None:
@@ -70,14 +76,12 @@ def register_supervisor(name: str, make_supervisor: Callable[[Env], Supervisor])
     Raises:
         ValueError: if the name is taken.
     """
-    if name in _SUPERVISORS:
-        raise ValueError(f"supervisor = {name!r} is registered already; choose another name")
-    _SUPERVISORS[name] = make_supervisor
+    SUPERVISORS.register(name, make_supervisor)
 
 
 def list_supervisors() -> tuple[str, ...]:
     """Return the registered names."""
-    return tuple(_SUPERVISORS)
+    return SUPERVISORS.names()
 
 
 @in_32_bits
@@ -108,8 +112,4 @@ def make(name: str, env: Env) -> Supervisor:
     """
     if not name:
         raise ValueError("supervisor = '' and the environment names none; register one and pass its name")
-    if name not in _SUPERVISORS:
-        from fleetjax.priority import unknown
-
-        raise ValueError(unknown("supervisor", name, _SUPERVISORS))
-    return _SUPERVISORS[name](env)
+    return SUPERVISORS.get(name)(env)

@@ -10,11 +10,11 @@ import numpy as np
 from fleetjax import priority, supervisors
 from fleetjax.config import Config
 from fleetjax.envs import Env
-from fleetjax.fleet import Fleet, FleetState, Plan
+from fleetjax.fleet import Fleet, FleetState, make_fleet
 from fleetjax.learning import critic, imitation
 from fleetjax.learning.networks import Normalizer
 from fleetjax.metrics import Metrics, rohe
-from fleetjax.types import EnvState, HumanState
+from fleetjax.types import EnvState, HumanState, Plan
 from reference import oracle
 
 # Tests compile more than they compute: with these, XLA compiles a fleet in a quarter of the time.
@@ -43,18 +43,13 @@ def start(config: Config, env: Env, key: jax.Array) -> FleetState:
     key_env, key_policy, *keys_critics = jax.random.split(key, 4)
     algorithm = priority.get_algorithm(config.algorithm)
     learner = imitation.make_learner(config, env.spec)
-    n, size = config.num_robots, env.spec.observation_size
-    critics = {kind: critic.make_critic(kind, config, env.spec, learner) for kind in algorithm.critics}
-    members = 1 if env.spec.discrete else config.ensemble_size
-    return FleetState(
-        timestep=jnp.zeros((), jnp.int32),
-        env=jax.vmap(env.reset)(jax.random.split(key_env, n), jnp.arange(n)),
-        humans=HumanState(jnp.full(config.num_humans, -1, jnp.int32), jnp.zeros(config.num_humans, jnp.int32)),
-        resetting=jnp.zeros(n, bool),
-        learner=learner.init(key_policy, Normalizer(jnp.zeros(size), jnp.ones(size), jnp.float32(10))),
-        human_data=imitation.create_data(env.spec, ensemble_size=members, capacity=config.human_capacity),
-        critics={kind: parts.init(key) for (kind, parts), key in zip(critics.items(), keys_critics, strict=False)},
-        priority=algorithm.make_priority(config).init(),
+    size = env.spec.observation_size
+    critics = {kind: critic.make_critic(kind, config, env.spec, learner) for kind in algorithm.estimators}
+    return make_fleet(config, env).init(
+        key_env,
+        learner.init(key_policy, Normalizer(jnp.zeros(size), jnp.ones(size), jnp.float32(10))),
+        imitation.create_data(env.spec, ensemble_size=config.ensemble_size, capacity=config.human_capacity),
+        {kind: parts.init(key) for (kind, parts), key in zip(critics.items(), keys_critics, strict=False)},
     )
 
 
@@ -75,7 +70,7 @@ def record(
     n, m = config.num_robots, config.num_humans
     learner = imitation.make_learner(config, env.spec)
     supervisor = supervisors.make(config.supervisor or env.spec.supervisor, env)
-    kinds = priority.get_algorithm(config.algorithm).critics
+    kinds = priority.get_algorithm(config.algorithm).estimators
     critics = {kind: critic.make_critic(kind, config, env.spec, learner) for kind in kinds}
 
     def timestep(state: FleetState, _: None):
@@ -85,10 +80,10 @@ def record(
         key_env, key_reset, key_goal, key_data, _ = jax.random.split(key_advance, 5)
         key_available, key_present = jax.random.split(jax.random.fold_in(key_t, 1))
 
-        robot_action = learner.predict(state.learner, state.env.obs)[0]
+        robot_action = learner.predict(state.policy, state.env.obs)[0]
         human_action = jax.vmap(supervisor.act)(state.env, jax.random.split(key_human, n))
         chance = {
-            kind: parts.value(state.critics[kind], state.learner.normalizer, state.env.obs, robot_action)
+            kind: parts.value(state.estimators[kind], state.policy.normalizer, state.env.obs, robot_action)
             for kind, parts in critics.items()
         }
         outcomes = {
@@ -96,7 +91,7 @@ def record(
             for name, action in {"robot": robot_action, "human": human_action}.items()
         }
         recorded = {
-            "uncertainty": learner.predict(state.learner, state.env.obs)[1],
+            "uncertainty": learner.predict(state.policy, state.env.obs)[1],
             "risk": chance.get("safety", jnp.zeros(n)),
             "goal": chance.get("goal", jnp.zeros(n)),
             "uniform": jax.random.uniform(key_score, (n,)),
@@ -124,8 +119,8 @@ def record(
 
 def count_stored(state: FleetState) -> dict[str, jax.Array]:
     """Return how many rows every buffer was given, and how many gradient steps the policy took."""
-    counts = {"human data": state.human_data.pairs.added, "gradient steps": state.learner.opt_state.count}
-    for kind, c in state.critics.items():
+    counts = {"human data": state.human_data.pairs.added, "gradient steps": state.policy.opt_state.count}
+    for kind, c in state.estimators.items():
         counts |= {f"{kind} critic's positives": c.positives.added, f"{kind} critic's negatives": c.negatives.added}
     return counts
 
@@ -143,12 +138,12 @@ def problem_of(config: Config, env: Env) -> oracle.Problem:
         initial_period=int(config.initial_period),
         uncertainty_threshold=float(config.uncertainty_threshold),
         risk_threshold=float(config.risk_threshold),
-        random_threshold=float(config.random_threshold),
-        thrifty_weight=float(config.thrifty_weight),
-        thrifty_threshold=float(config.thrifty_threshold),
+        random_threshold=float(config.parameters.get("random_threshold", np.nan)),
+        thrifty_weight=float(config.parameters.get("thrifty_weight", np.nan)),
+        thrifty_threshold=float(config.parameters.get("thrifty_threshold", np.nan)),
         learns=algorithm.updates,
         gradient_steps=config.gradient_steps,
-        ring_sizes=dict.fromkeys(algorithm.critics, rings),
+        ring_sizes=dict.fromkeys(algorithm.estimators, rings),
         new_goals=env.next_goal is not None,
     )
 
@@ -213,7 +208,7 @@ def _compare_data(last: FleetState, fleet: oracle.Fleet) -> None:
     same("resampled pairs", t, last.human_data.resample[:size].T, fleet.resample)
     for kind, c in fleet.critics.items():
         for label in ("positives", "negatives"):
-            ring, expected = getattr(last.critics[kind], label), getattr(c, label)
+            ring, expected = getattr(last.estimators[kind], label), getattr(c, label)
             place = (int(ring.added) - len(expected) + np.arange(len(expected))) % ring.capacity
             for k, field in enumerate(ring.rows._fields):
                 stored = getattr(ring.rows, field)

@@ -31,7 +31,9 @@ def program(*, new_goals: bool = False, gradient_steps: int = 0) -> Any:
         env = toy_envs.scripted(falls_at, succeeds_at, horizon=HORIZON, new_goals=new_goals)
         sizes = {"num_robots": N, "num_humans": M, "num_steps": T, "gradient_steps": gradient_steps}
         with pytest.MonkeyPatch.context() as patch:
-            patch.setitem(priority._ALGORITHMS, "scripted", Algorithm(lambda config: rule, ("safety", "goal")))
+            patch.setitem(
+                priority.ALGORITHMS.entries, "scripted", Algorithm(lambda config: rule, estimators=("safety", "goal"))
+            )
             config = fleetjax.make_config(env, "scripted", **sizes, **TINY).replace(**timing)
             start = recording.start(config, env, jax.random.key(1))
             fleet = fleetjax.make_fleet(config, env)
@@ -64,7 +66,7 @@ def make_counting_learner(config, spec) -> imitation.Learner:
         return state._replace(params=seen, opt_state=Counter(state.opt_state.count + 1)), seen
 
     return imitation.Learner(
-        init=lambda key, normalizer: imitation.LearnerState(jnp.zeros(()), Counter(jnp.int32(0)), normalizer),
+        init=lambda key, normalizer: imitation.PolicyState(jnp.zeros(()), Counter(jnp.int32(0)), normalizer),
         predict=lambda state, obs: (
             jnp.broadcast_to(state.params, (*obs.shape[:-1], spec.action_size)),
             jnp.broadcast_to(state.params, obs.shape[:-1]),

@@ -1,0 +1,43 @@
+"""Rules for who gets help: from signals of the robots to scores (paper, Section 4.2). One file a family.
+
+A priority is two pure functions. A new one is about ten lines:
+
+    def make_least_certain(config):
+        def score(signals, aux, key):
+            return jnp.where(signals.violation, 1.0, signals.uncertainty), aux
+
+        return Priority(init=lambda: (), score=score)
+
+    fleetjax.register_priority("least_certain", make_least_certain)
+"""
+
+from fleetjax.priority.base import (
+    ALGORITHMS,
+    Algorithm,
+    Priority,
+    get_algorithm,
+    list_algorithms,
+    register_algorithm,
+    register_priority,
+    stateless,
+)
+from fleetjax.priority.baselines import BASELINES
+from fleetjax.priority.dagger import DAGGERS
+from fleetjax.priority.orders import ORDERS
+from fleetjax.priority.ranks import above, lexicographic
+
+__all__ = [
+    "ALGORITHMS",
+    "Algorithm",
+    "Priority",
+    "above",
+    "get_algorithm",
+    "lexicographic",
+    "list_algorithms",
+    "register_algorithm",
+    "register_priority",
+    "stateless",
+]
+
+for _name, _algorithm in {**BASELINES, **DAGGERS, **ORDERS}.items():
+    register_algorithm(_name, _algorithm)

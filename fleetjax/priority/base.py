@@ -1,0 +1,103 @@
+"""What a rule for help is made of: a priority, an allocator, what it learns, and parameters of its own."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+
+from fleetjax.allocation import Allocator, allocate
+from fleetjax.field import Field
+from fleetjax.registry import Registry
+from fleetjax.types import Signals
+
+
+class Priority(NamedTuple):
+    """A rule for who gets help.
+
+    Attributes:
+        init: `() -> aux`, what the rule carries from one timestep to the next.
+        score: `(Signals[N], aux, key) -> (f32[N], aux)`, scores >= 0; 0 = no help even if a human is free.
+    """
+
+    init: Callable[[], Any]
+    score: Callable[[Signals, Any, jax.Array], tuple[jax.Array, Any]]
+
+
+def stateless(score: Callable[[Signals, jax.Array], jax.Array]) -> Priority:
+    """Return the priority that scores by `(Signals[N], key) -> f32[N]` and remembers nothing."""
+    return Priority(init=lambda: (), score=lambda signals, aux, key: (score(signals, key), aux))
+
+
+@dataclasses.dataclass(frozen=True)
+class Algorithm:
+    """A rule for help, and what the fleet must do and learn for it.
+
+    Attributes:
+        make_priority: `config -> Priority`.
+        estimators: registered names of the numbers to learn for each robot: `"safety"` gives `Signals.risk`, `"goal"`
+            gives `Signals.goal`, all are in `Signals.estimates`.
+        make_allocate: `config -> Allocator`; by default the paper's Algorithm 1.
+        parameters: what this algorithm alone has, by name; traced. A rule reads `config.parameters["name"]`.
+        defaults: `config -> fields` of `Config` whose default it changes.
+        sees_supervisor: whether `Signals.human_action` is filled, for ceilings that no real fleet could have.
+        pretrains: whether demonstrations are collected and the policy is cloned before the fleet starts.
+        updates: whether human data are recorded and learnt from while the fleet runs.
+    """
+
+    make_priority: Callable[[Any], Priority]
+    _: dataclasses.KW_ONLY
+    estimators: tuple[str, ...] = ()
+    make_allocate: Callable[[Any], Allocator] = lambda config: allocate
+    parameters: Mapping[str, Field] = dataclasses.field(default_factory=dict)
+    defaults: Callable[[Any], Mapping[str, Any]] = lambda config: {}
+    sees_supervisor: bool = False
+    pretrains: bool = True
+    updates: bool = True
+
+
+ALGORITHMS: Registry[Algorithm] = Registry("algorithm")
+
+
+def register_algorithm(name: str, algorithm: Algorithm) -> None:
+    """Make an algorithm available to `make_config` under `name`.
+
+    Raises:
+        ValueError: if the name is taken.
+    """
+    ALGORITHMS.register(name, algorithm)
+
+
+def register_priority(
+    name: str,
+    make_priority: Callable[[Any], Priority],
+    *,
+    estimators: tuple[str, ...] = ("safety",),
+    parameters: Mapping[str, Field] | None = None,
+) -> None:
+    """Make a priority available as an algorithm that clones demonstrations and learns from interventions.
+
+    Args:
+        name: what `make_config` calls it.
+        make_priority: `config -> Priority`.
+        estimators: registered names of what it reads: `"safety"` for `Signals.risk`, `"goal"` for `Signals.goal`.
+        parameters: what this algorithm alone has, by name.
+
+    Raises:
+        ValueError: if the name is taken.
+    """
+    register_algorithm(name, Algorithm(make_priority, estimators=tuple(estimators), parameters=dict(parameters or {})))
+
+
+def list_algorithms() -> tuple[str, ...]:
+    """Return the registered names, orders of C, U and R included."""
+    return ALGORITHMS.names()
+
+
+def get_algorithm(name: str) -> Algorithm:
+    """Return a registered algorithm.
+
+    Raises:
+        ValueError: if there is none of that name; the message has the closest ones.
+    """
+    return ALGORITHMS.get(name)

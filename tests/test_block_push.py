@@ -160,6 +160,7 @@ def test_the_teacher_knows_all_good_pushes(position, angle, goal, good):
     assert counts[sorted(good)].min() > 0.4 * 400 / len(good)
 
 
+@pytest.mark.slow
 def test_the_teacher_reaches_goal_after_goal_without_a_violation(env):
     config = fleetjax.make_config("block_push", "expert", num_robots=64, num_steps=250)
     metrics = jax.jit(fleetjax.run)(config, jax.random.key(0)).metrics
@@ -167,6 +168,8 @@ def test_the_teacher_reaches_goal_after_goal_without_a_violation(env):
     assert int(metrics.successes.sum()) / 64 > 30  # a goal every eight pushes
 
 
+@pytest.mark.statistical
+@pytest.mark.slow
 def test_what_the_teacher_shows_is_learnt_from_images():
     """A policy of chance reaches none of these goals: see the second half."""
     config = fleetjax.make_config("block_push", "constraint", num_steps=60, num_robots=24, pretraining_steps=300)

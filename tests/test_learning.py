@@ -71,6 +71,8 @@ def humanoid_fleet():
     return config, jax.jit(fleetjax.prepare)(config, jax.random.key(0))
 
 
+@pytest.mark.statistical
+@pytest.mark.slow
 def test_safety_critic_foresees_falls_of_the_humanoid(humanoid_fleet):
     """Held out: fresh robots under the first clone; the label is a violation within the next five steps."""
     config, state = humanoid_fleet

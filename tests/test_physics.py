@@ -113,6 +113,7 @@ BOUNDS = {  # m and rad; m/s and rad/s; N and N m; m/s^2 and rad/s^2
 }
 
 
+@pytest.mark.slow
 @each_robot
 def test_mjx_agrees_with_native(name):
     """One control step; the largest error of a robot, over robots: median and 95th percentile.
@@ -160,6 +161,8 @@ def act(name: str, backend: str, num_steps: int):
     return steps
 
 
+@pytest.mark.statistical
+@pytest.mark.slow
 @each_robot
 def test_robots_violate_as_often_on_both_backends(name):
     """Share of violations within 200 steps, and steps before them: they differ by less than three standard errors."""

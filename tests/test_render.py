@@ -65,6 +65,7 @@ def test_bodies_are_drawn_where_they_are(scene):
     np.testing.assert_array_equal(again, pictures[0])
 
 
+@pytest.mark.slow
 def test_a_film_is_that_of_the_run():
     small = {"num_robots": 3, "num_humans": 3, "num_steps": 4}
     config = fleetjax.make_config("humanoid", "expert", **small)

@@ -518,6 +518,7 @@ def rows(path: Path) -> int:
     return (path / "metrics.csv").read_bytes().count(b"\n") - 1 if (path / "metrics.csv").exists() else 0
 
 
+@pytest.mark.slow
 def test_kills_at_random_moments_lose_no_bit(tmp_path, whole, spawn):
     path, rng = tmp_path / "killed", np.random.default_rng(0)
     arguments, resumed = (*RUN, "--output", path, "--checkpoint-every", 10), 0

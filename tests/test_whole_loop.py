@@ -129,6 +129,7 @@ def is_mujoco_robot(name: str) -> bool:
     return isinstance(state.physics, PhysicsState)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in fleetjax.list_envs() if is_mujoco_robot(name)])
 def test_loop_runs_on_mjx(name):
     """Demonstrations, pre-training and a few timesteps; a demonstration is cut short, since MJX takes its time on a CPU."""

@@ -4,6 +4,7 @@ from fleetjax import envs
 from fleetjax.allocation import allocate
 from fleetjax.config import Config, make_config, validate
 from fleetjax.envs import Env, EnvSpec, list_envs, register_env
+from fleetjax.envs.checking import check_env
 from fleetjax.field import Field
 from fleetjax.fleet import Fleet, FleetState, make_fleet
 from fleetjax.learning.estimators import Estimator, Step, register_estimator
@@ -35,6 +36,7 @@ __all__ = [
     "Step",
     "Supervisor",
     "allocate",
+    "check_env",
     "envs",
     "evaluate",
     "extend",

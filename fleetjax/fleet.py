@@ -178,7 +178,7 @@ def act(
     stepped, sound = step_robots(parts, state.env, action, moving, key_env)
     steps = Step(state.env.obs, action, stepped.obs, stepped.violation, stepped.success, planned.robot_action, given)
     humans = planned.humans._replace(duration=jnp.where(planned.humans.robot >= 0, planned.humans.duration + 1, 0))
-    correction = jnp.where(given, jnp.mean((human_action - planned.robot_action) ** 2, axis=-1), 0.0)
+    correction = jnp.where(given & sound, jnp.mean((human_action - planned.robot_action) ** 2, axis=-1), 0.0)
     before, state = state, remember(parts, state, steps, given & sound, moving & sound, key_data)
     renewed, reset_done = renew(parts, stepped, planned, humans, moving, key_reset, key_goal)
     state, loss = learn(parts, state, key_learn)

@@ -1,7 +1,7 @@
 """Every parameter of a run: its meaning, unit, default, and whether changing it compiles anew.
 
 Static fields shape the program. Traced fields are arrays: `vmap` over them sweeps them in one compilation. Defaults are the
-paper's (Section 5.2 and Appendix); environments change some of them, see `fleetjax.list_envs`.
+paper's (Section 5.2 and Appendix); environments change some of them, see `fleetjax.envs.get_defaults`.
 """
 
 import dataclasses
@@ -35,7 +35,7 @@ class Config:
 
     Attributes:
         parameters: the algorithm's own, by name: f32, i32 or bool scalars, traced.
-        capacity_given: whether `human_capacity` was asked for; else it follows from the other fields.
+        capacity_given: whether `human_capacity` was set explicitly; otherwise it is derived from the other fields.
     """
 
     environment: str = _static("humanoid", "registered environment")
@@ -82,8 +82,8 @@ class Config:
         Traced ones become i32, f32 or bool scalars. A new algorithm brings its own parameters, with their defaults.
 
         Raises:
-            ValueError: if a field is unknown, a parameter is another algorithm's, an integer field gets a value that is none,
-                or the number of demonstrations is traced and no `human_capacity` says how many pairs there may be.
+            ValueError: if a field is unknown, a parameter is another algorithm's, an integer field gets a value that is not an
+                integer, or the number of demonstrations is traced and no `human_capacity` says how many pairs there may be.
         """
         known = all_fields(changes.get("algorithm", self.algorithm))
         for name in changes:

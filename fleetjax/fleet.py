@@ -44,7 +44,7 @@ class FleetState(NamedTuple):
         timestep: i32[] timesteps completed.
         env: EnvState[N].
         humans: HumanState[M] at the end of the last timestep.
-        resetting: bool[N] type of each robot's last intervention: hard reset, or teleoperation.
+        resetting: bool[N] whether a human was resetting the robot at the last timestep.
         correction: f32[N] see `Signals`.
         policy: what the robots have learnt.
         human_data: what they learn from.
@@ -84,7 +84,7 @@ class Parts(NamedTuple):
 
 
 class Fleet(NamedTuple):
-    """Pure functions of a fleet. Keys: one a timestep, `fold_in(key, t)`.
+    """Pure functions of a fleet. Each timestep has its own key.
 
     Attributes:
         init: `(key, PolicyState, HumanData, estimators' states) -> FleetState` at t = 0.
@@ -154,7 +154,7 @@ def logged_step(parts: Parts, state: FleetState, key: jax.Array) -> tuple[FleetS
 
 
 def plan(parts: Parts, state: FleetState, key: jax.Array, available: jax.Array | None = None) -> tuple[FleetState, Plan]:
-    """Say who needs whom: signals, scores, allocation (paper, Section 4)."""
+    """Decide which human helps which robot: signals, scores, allocation (paper, Section 4)."""
     config = parts.config
     key_score, key_ties = jax.random.split(key)
     signals = observe(parts, state, key)
@@ -230,7 +230,7 @@ def reset_robots(parts: Parts, key: jax.Array) -> EnvState:
 def step_robots(
     parts: Parts, env: EnvState, action: jax.Array, moving: jax.Array, key: jax.Array
 ) -> tuple[EnvState, jax.Array]:
-    """Step the robots that move; return EnvState[N], and bool[N] who has finite numbers. Who has not is in violation."""
+    """Step the robots that move; return EnvState[N], and bool[N] whose numbers are finite. The others are in violation."""
     keys = jax.random.split(key, parts.config.num_robots)
     stepped = where(moving, jax.vmap(parts.env.step)(env, action, moving, keys), env)
     sound = finite((env.obs, action, stepped.obs, stepped.reward))

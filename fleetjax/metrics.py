@@ -32,7 +32,7 @@ class Metrics(NamedTuple):
         switches: robots whose human differs from the last timestep's, starts and ends included.
         moving: robots that acted.
         choices: robots newly given to a human.
-        risk_choices: those of them that only their risk spoke for: no violation, uncertainty below its threshold.
+        risk_choices: those of them chosen for their risk alone: no violation, uncertainty below its threshold.
         dropped: pairs of human data for which there was no room; at t = 0 also those of the demonstrations.
         diverged: what of `LEARNT` is not finite, the sum of 1, 2, 4, 8 and 16 for each; see `first_divergence`.
         reward: f32 sum of rewards over moving robots.

@@ -40,8 +40,8 @@ def prepare(config: Config, key: jax.Array, env: envs.Env | None = None) -> Flee
         key: random key; `run(config, key)` starts from `prepare(config, key)`.
         env: the environment, if it is not the registered one that the configuration names.
 
-    Collecting whole episodes takes loops whose length depends on what happens in them, so there are forward derivatives
-    through this function and none in reverse; `run` from a given state has both.
+    Collecting whole episodes takes loops whose length depends on what happens in them, so only forward-mode differentiation
+    works through this function. `run` from a given state supports both modes where the physics does.
 
     Raises:
         ValueError: if the configuration is not valid, or the run cannot fit the memory.
@@ -61,11 +61,11 @@ def prepare(config: Config, key: jax.Array, env: envs.Env | None = None) -> Flee
 
 
 def extend(state: FleetState, num_pairs: int) -> FleetState:
-    """Return the same state with room for more human data, for runs that go on from it.
+    """Return the same state with room for more human data, for runs that continue from it.
 
     Args:
         state: of one fleet, or of several under `vmap`.
-        num_pairs: how many pairs there shall be more room for; each augmented copy counts.
+        num_pairs: number of additional pairs to make room for; each augmented copy counts as one.
 
     Raises:
         ValueError: if `num_pairs` is not a whole number of at least 0, or the room would exceed 32 bits.
@@ -93,9 +93,10 @@ def extend(state: FleetState, num_pairs: int) -> FleetState:
 def run(config: Config, key: jax.Array, state: FleetState | None = None, env: envs.Env | None = None) -> Result:
     """Run a fleet for `config.num_steps` timesteps.
 
-    Pure: `jax.jit`, `jax.vmap` over keys and over configs, and so on. Timestep t uses `fold_in(key, t)`, so that a run
-    continued from a state of it, with the same key, is the same run. `vmap` computes runs side by side, which rounds matrix
-    products differently, and a last bit can decide who is helped; `jax.lax.map` gives each run the bits that it has alone.
+    Pure: `jax.jit`, `jax.vmap` over keys and over configs, and so on. Each timestep derives its key from `key`, so a run
+    continued from one of its own states, with the same key, gives the same result. `vmap` computes runs side by side, which
+    rounds matrix products differently, and a last bit can decide who is helped; `jax.lax.map` gives each run the bits that it
+    has alone.
 
     Args:
         config: configuration.

@@ -50,7 +50,7 @@ class Signals(NamedTuple):
 
     Attributes:
         violation: bool[N] the constraint indicator c(s).
-        uncertainty: f32[N] disagreement of the policy ensemble, in [0, 1].
+        uncertainty: f32[N] disagreement of the policy ensemble, in [0, 1]; entropy in nats where actions are discrete.
         risk: f32[N] probability of a constraint violation by the safety critic; 0 without one.
         goal: f32[N] probability of success by the goal critic; 0 without one.
         timestep: i32[] timesteps since the fleet started.
@@ -59,10 +59,10 @@ class Signals(NamedTuple):
         robot_action: f32[N, A] what the robots' policy would do.
         helped: bool[N] whether a human helped the robot at the last timestep.
         help_time: i32[N] timesteps of that help so far; 0 without help.
-        correction: f32[N] mean square of the human's action less the robot's where the robot was teleoperated at the last
-            timestep, else 0.
+        correction: f32[N] mean squared difference between the human's and the robot's action, if the robot was teleoperated
+            at the last timestep; else 0.
         human_action: f32[N, A] what the supervisor would do; None unless the algorithm has `sees_supervisor`.
-        link: f32[N] how well each robot can be reached: 1, unless the model of the humans has links.
+        link: f32[N] how well each robot can be reached; 1 for all.
     """
 
     violation: jax.Array

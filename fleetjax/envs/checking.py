@@ -106,8 +106,8 @@ def _differences(first: EnvState, after: Any) -> Iterator[str]:
 
 def _faults_in_motion(env: Env) -> Iterator[str]:
     """Yield what is wrong with some episodes under random actions."""
-    states = jax.device_get(jax.jit(lambda key: _play(env, key))(jax.random.key(0)))
-    first, after, last = states
+    played = jax.lax.map(lambda key: _play(env, key), jax.random.key(0)[None])  # as one program
+    first, after, last = jax.tree.map(lambda x: x[0], jax.device_get(played))
     moved = ~np.concatenate([first.violation[None], after.violation[:-1]])
     if any(np.any(getattr(first, name)) for name in ("reward", "success", "timeout", "episode_return", "episode_step")):
         yield "reset must set reward, success, timeout, episode_return and episode_step to 0, as envs.begin does"

@@ -67,7 +67,7 @@ class _Parser(argparse.ArgumentParser):
 
 _EXPORT_ABOUT = """Write what humans who teleoperated saw and did, an episode for each intervention, as other tools read it. The
 run must have been made with --log-interventions."""
-_RENDER_ABOUT = """Draw robots as an animation, a grid of tiles. Who is teleoperated is tinted blue, who is in violation red.
+_RENDER_ABOUT = """Draw robots as an animation, a grid of tiles. Teleoperated robots are tinted blue, robots in violation red.
 
 expert: the supervisor acts on every robot. robot: the trained policy of a run acts, and nobody teleoperates. mixed: the fleet
 as it runs, from its pre-training on, with humans who come to help."""

@@ -15,7 +15,7 @@ from fleetjax.types import EnvState
 
 
 class Step(NamedTuple):
-    """A step of each robot; [N] in front of every shape.
+    """One step of every robot; every array has a leading axis N.
 
     Attributes:
         obs: f32[O] before the step.

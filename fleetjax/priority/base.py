@@ -17,7 +17,7 @@ class Priority(NamedTuple):
 
     Attributes:
         init: `() -> aux`, what the rule carries from one timestep to the next.
-        score: `(Signals[N], aux, key) -> (f32[N], aux)`, scores >= 0; 0 = no help even if a human is free.
+        score: `(Signals[N], aux, key) -> (f32[N], aux)`, scores >= 0; 0 = no new help even if a human is free.
     """
 
     init: Callable[[], Any]
@@ -38,9 +38,9 @@ class Algorithm:
         estimators: registered names of the numbers to learn for each robot: `"safety"` gives `Signals.risk`, `"goal"`
             gives `Signals.goal`, all are in `Signals.estimates`.
         make_allocate: `config -> Allocator`; by default the paper's Algorithm 1.
-        parameters: what this algorithm alone has, by name; traced. A rule reads `config.parameters["name"]`.
-        defaults: `config -> fields` of `Config` whose default it changes.
-        sees_supervisor: whether `Signals.human_action` is filled, for ceilings that no real fleet could have.
+        parameters: this algorithm's own, by name; traced. A rule reads `config.parameters["name"]`.
+        defaults: `config -> fields` of `Config` whose defaults it overrides.
+        sees_supervisor: whether `Signals.human_action` is filled, for upper bounds that no real fleet could reach.
         pretrains: whether demonstrations are collected and the policy is cloned before the fleet starts.
         updates: whether human data are recorded and learnt from while the fleet runs.
     """

@@ -39,7 +39,7 @@ def as_many_demonstrations(config) -> Mapping[str, Any]:
 
 
 def as_many_gradient_steps(config) -> Mapping[str, Any]:
-    """Give as many gradient steps as the online algorithms take in all, besides."""
+    """Give, in addition, as many gradient steps as the online algorithms take in total."""
     steps = config.pretraining_steps + config.num_steps * config.gradient_steps
     return {**as_many_demonstrations(config), "pretraining_steps": steps}
 

@@ -345,12 +345,12 @@ def validate(config: Config, env: "envs.Env | None" = None) -> None:
 def _check_range(name: str, value: Any, field: Field) -> None:
     if field.kind in (str, tuple, bool) or not _is_concrete(value):
         return
-    values = np.asarray(value)
+    values = np.asarray(value, np.float64)  # holds derived whole numbers that no integer type does
     low, high = field.low, field.high
     if np.all(np.isfinite(values)) and (low is None or np.all(values >= low)) and (high is None or np.all(values <= high)):
         return
     allowed = f"in [{low}, {high}]" if high is not None else f"at least {low}"
-    shown = values if values.ndim else values.item()
+    shown = value if values.ndim or isinstance(value, int) else value.item()
     raise ValueError(f"{name} = {shown} must be {allowed}{' ' + field.unit if field.unit else ''}")
 
 

@@ -11,6 +11,7 @@ from compiling import compiled
 import fleetjax
 from fleetjax import HumanState, Signals, envs, priority, supervisors
 from fleetjax.allocation import allocate
+from fleetjax.config import get_value
 from fleetjax.physics.base import PhysicsState
 
 NUM_ROBOTS = 8
@@ -258,17 +259,21 @@ def jitted(name):
     return compiled(functools.partial(decide, name))
 
 
-@pytest.fixture(scope="module")
-def settings():
-    return fleetjax.make_config("navigation", random_threshold=0.4, thrifty_threshold=0.5, initial_period=50)
+def settings_of(name):
+    """Return settings in which every rule helps somebody."""
+    lower = {"random_threshold": 0.4, "thrifty_threshold": 0.5}
+    own = priority.get_algorithm(name).parameters
+    config = fleetjax.make_config("navigation", initial_period=50)
+    return config.replace(algorithm=name, **{field: value for field, value in lower.items() if field in own})
 
 
 @each_algorithm
-def test_algorithm_scores(name, settings):
+def test_algorithm_scores(name):
     """f32[N] >= 0; a memory of fixed structure; whoever is helped has a score; jit or not; thresholds do not recompile."""
+    settings = settings_of(name)
     aux = priority.get_algorithm(name).make_priority(settings).init()
-    traced = ("uncertainty_threshold", "risk_threshold", "random_threshold", "thrifty_weight", "thrifty_threshold")
-    halved = settings.replace(**{field: getattr(settings, field) / 2 for field in traced})
+    traced = ("uncertainty_threshold", "risk_threshold", *settings.parameters)
+    halved = settings.replace(**{field: get_value(settings, field) / 2 for field in traced})
     helped = 0
     for i, config in enumerate((settings, settings.replace(initial_period=20), halved)):
         signals, key = make_signals(jax.random.key(i)), jax.random.key(i)
@@ -286,8 +291,9 @@ def test_algorithm_scores(name, settings):
 
 
 @each_algorithm
-def test_algorithm_gives_no_human_for_nan(name, settings):
-    """A signal that is no number speaks for nobody: whoever gets a score, or help, would have a score if it were 0."""
+def test_algorithm_gives_no_human_for_nan(name):
+    """A NaN signal speaks for nobody: whoever gets a score, or help, would have a score if it were 0."""
+    settings = settings_of(name)
     aux = priority.get_algorithm(name).make_priority(settings).init()
     for field in ("uncertainty", "risk", "goal"):
         signals = make_signals(jax.random.key(0))

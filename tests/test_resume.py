@@ -478,7 +478,7 @@ def test_a_policy_that_diverges_ends_the_run_and_says_when(stopped, capsys):
     learner = found.state.policy
     spoilt = learner._replace(params=jax.tree.map(lambda x: x.at[1].set(np.nan), learner.params))
     writer = checkpoint.Writer(stopped, identity)
-    writer.write(found.state._replace(learner=spoilt), found.notes)
+    writer.write(found.state._replace(policy=spoilt), found.notes)
     writer.wait()
     assert run_here("run", "--resume", stopped) == 1
     line = capsys.readouterr().err.splitlines()[-1]

@@ -145,4 +145,5 @@ def test_loop_runs_on_mjx(name):
     assert np.all(np.isfinite(metrics.policy_loss))
     assert np.all(np.isfinite(result.state.env.obs))
     assert not np.any(result.state.env.physics.diverged)
-    np.testing.assert_allclose(result.state.env.physics.time, result.state.env.episode_step * env.spec.control_step, rtol=1e-4)
+    elapsed = np.asarray(result.state.env.episode_step) * env.spec.control_step
+    np.testing.assert_allclose(result.state.env.physics.time, elapsed, rtol=1e-4)

@@ -58,7 +58,7 @@ def check_memory(config: Config, env: Env) -> None:
     """Check that the arrays that a run cannot do without fit the memory.
 
     Raises:
-        ValueError: if they do not; the message has the estimate, the memory there is, and the fields to reduce.
+        ValueError: if they do not; the message has the estimate, the memory there is, and the field to reduce.
     """
     state = state_shapes(config, env)
     learnt = jax.tree.leaves(state.estimators, is_leaf=lambda x: isinstance(x, Buffer))

@@ -12,6 +12,7 @@ from fleetjax import envs
 from fleetjax.checks import check_run, check_state
 from fleetjax.config import Config
 from fleetjax.fleet import FleetState, init, logged_step, make_fleet, make_parts
+from fleetjax.keys import key_at
 from fleetjax.learning.imitation import PolicyState, create_data
 from fleetjax.learning.pretraining import pretrain
 from fleetjax.metrics import Metrics
@@ -49,8 +50,7 @@ def prepare(config: Config, key: jax.Array, env: envs.Env | None = None) -> Flee
     Reference: paper, Section 5.2.
     """
     env = check_run(config, env)
-    key_prepare, _ = jax.random.split(key)
-    key_policy, key_estimators, key_reset = jax.random.split(key_prepare, 3)
+    key_policy, key_estimators, key_reset = jax.random.split(key_at(key, -1), 3)
     parts = make_parts(config, env)
     policy, data = pretrain(config, env, parts.learner, parts.supervisor, key_policy)
     estimators = {
@@ -150,10 +150,9 @@ def _run(
     start = prepare(config, key, env) if state is None else state
 
     step = make_step(env)
-    _, key_steps = jax.random.split(key)
 
     def timestep(state: FleetState, _: None) -> tuple[FleetState, Any]:
-        return step(state, jax.random.fold_in(key_steps, state.timestep))
+        return step(state, key_at(key, state.timestep))
 
     last, given = jax.lax.scan(timestep, start, length=config.num_steps)
     return given, last
@@ -180,9 +179,8 @@ def evaluate(config: Config, key: jax.Array, policy: PolicyState, env: envs.Env 
     members = jax.tree.leaves(policy.params)[0].shape[0]
     config = without_teleoperation(config).replace(ensemble_size=members)
     env = check_run(config, env)
-    key_reset, _ = jax.random.split(key)
     nothing = create_data(env.spec, ensemble_size=members, capacity=1)
-    return run(config, key, init(make_parts(config, env), key_reset, policy, nothing, {}), env)
+    return run(config, key, init(make_parts(config, env), key_at(key, -1), policy, nothing, {}), env)
 
 
 def without_teleoperation(config: Config) -> Config:

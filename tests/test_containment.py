@@ -67,10 +67,9 @@ def test_one_robots_numbers_do_not_reach_its_neighbours(name):
     env, fleet, first = fleet_of(config)
 
     def step(state, key, spoilt_action):
-        key_plan, key_advance = jax.random.split(key)
-        state, plan = fleet.plan(state, key_plan)
-        action = 0.1 * jax.random.normal(key_advance, (N, env.spec.action_size))
-        return fleet.advance(state, plan, action.at[BAD, 0].add(spoilt_action), plan.teleoperated, key_advance)
+        state, plan = fleet.plan(state, key)
+        action = 0.1 * jax.random.normal(key, (N, env.spec.action_size))
+        return fleet.advance(state, plan, action.at[BAD, 0].add(spoilt_action), plan.teleoperated, key)
 
     step = quick_jit(step)
     expected, _ = step(first, jax.random.key(1), 0.0)

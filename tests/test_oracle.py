@@ -61,7 +61,7 @@ def toy_supervisors():
         yield
 
 
-def run_both(env, configs: list[fleetjax.Config], absences: list[float], seed: int = 0):
+def run_both(env, configs: list[fleetjax.Config], absences: list[float], seed: int = 1):
     """Return the trace of each configuration and what the oracle saw; they differ in traced fields only."""
 
     def run(config, absence, key):

@@ -17,6 +17,7 @@ from fleetjax import envs
 from fleetjax.allocation import helper_of
 from fleetjax.config import Config
 from fleetjax.fleet import FleetState, make_fleet
+from fleetjax.keys import key_at
 from fleetjax.learning.imitation import PolicyState
 from fleetjax.run import evaluate, prepare, run, without_teleoperation
 from fleetjax.types import EnvState
@@ -91,10 +92,9 @@ def shoot(config: Config, key: jax.Array, state: FleetState, *, num_shown: int) 
     draw = env.picture
     look: Callable[[EnvState], Any] = env.scene.pose if env.scene else lambda state: (draw(state),) if draw else ()
     fleet = make_fleet(config, env)
-    _, key_steps = jax.random.split(key)
 
     def timestep(state: FleetState, _: None):
-        after, _metrics = fleet.step(state, jax.random.fold_in(key_steps, state.timestep))
+        after, _metrics = fleet.step(state, key_at(key, state.timestep))
         helped = helper_of(after.humans, config.num_robots) >= 0
         seen = jax.tree.map(lambda x: x[:num_shown], (state.env, helped & ~after.resetting))
         return after, Film(jax.vmap(look)(seen[0]), seen[0].violation, seen[1])

@@ -135,7 +135,6 @@ def get_defaults(name: str) -> Mapping[str, Any]:
     return ENVIRONMENTS.get(name).defaults
 
 
-@functools.cache
 def make(name: str, backend: str = "auto") -> Env:
     """Return a registered environment; the same object for the same arguments.
 
@@ -146,6 +145,11 @@ def make(name: str, backend: str = "auto") -> Env:
     Raises:
         ValueError: if a name is unknown.
     """
+    return _make(name, backend)
+
+
+@functools.cache  # by position: a cached function would keep a default apart from the same value given
+def _make(name: str, backend: str) -> Env:
     make_env = ENVIRONMENTS.get(name).make_env
     with jax.ensure_compile_time_eval(), jax.enable_x64(False):  # constants must outlive the trace that may be running
         return make_env(backend)

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from fleetjax.physics.base import PhysicsState, contain_divergence
+from fleetjax.physics.contract import PhysicsState, contain_divergence
 
 
 def num_threads() -> int:

@@ -46,11 +46,11 @@ class Options(NamedTuple):
 
     Attributes:
         host: address that is served.
-        port: 0 = any.
-        token: what every page needs; None = nothing.
-        interval: seconds a timestep.
+        port: 0 = any free one.
+        token: what every page needs; None = no token.
+        interval: seconds per timestep.
         timeout: seconds of silence after which a seat is free.
-        wait: people without whom the first timestep does not begin.
+        wait: people to wait for before the first timestep.
         simulated: whether the simulated supervisor plays seats that nobody takes.
     """
 

@@ -87,7 +87,7 @@ def test_parameters_are_traced_checked_swept_and_the_algorithms_alone(capsys):
     assert config.replace(algorithm="uc").parameters == {}
     with pytest.raises(ValueError, match=r"weight = 3\.0 must be in \[0, 2\]"):
         fleetjax.make_config("navigation", "weighing", weight=3)
-    elsewhere = "weight is a parameter of algorithm = 'weighing', and not of 'uc'"
+    elsewhere = "weight is a parameter of algorithm = 'weighing', not of 'uc'"
     with pytest.raises(ValueError, match=elsewhere):
         fleetjax.make_config("navigation", "uc", weight=0.1)
     with pytest.raises(ValueError, match=elsewhere):

@@ -166,7 +166,7 @@ class Console:
             sending.cancel()
 
     def _hear(self, client: Client, text: str | None) -> None:
-        """Do what a page asks for, or tell it why not; one that is being closed is not heard any more."""
+        """Do what a page asks for, or tell it why not; one that is being closed is no longer heard."""
         if client.closing:
             return
         client.heard += 1

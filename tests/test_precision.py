@@ -27,7 +27,7 @@ SMALL = {
 
 def run_navigation():
     """Make everything anew, as a process does that has the setting from its beginning."""
-    envs.make.cache_clear()
+    envs._make.cache_clear()
     config = fleetjax.make_config("navigation", "cur", **SMALL)
     result = compiled(fleetjax.run)(config, jax.random.key(0))
     frozen = compiled(fleetjax.evaluate)(config, jax.random.key(1), result.state.policy)

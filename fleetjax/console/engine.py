@@ -1,6 +1,6 @@
 """A fleet that takes one timestep at a time, in two halves: `plan`, then people act, then `advance`.
 
-The logic is `fleetjax.fleet`'s. What people gave comes in as plain arrays, so that a record of it gives the same run again.
+The logic is `fleetjax.fleet`'s. What people gave comes in as plain arrays, so that a record of it repeats the same run.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,10 +13,10 @@ import numpy as np
 
 from fleetjax.config import Config
 from fleetjax.envs import Env
+from fleetjax.experiment import prepare
 from fleetjax.fleet import FleetState, make_fleet, make_parts, supervise
 from fleetjax.keys import key_at, split_keys
 from fleetjax.metrics import Metrics
-from fleetjax.run import prepare
 from fleetjax.types import EnvState, Plan, Signals
 
 EMPTY, PERSON, SIMULATED = 0, 1, 2  # who sits in a seat
@@ -29,7 +29,7 @@ class Inputs(NamedTuple):
         seat: u8[M] who sat there: `EMPTY`, `PERSON` or `SIMULATED`.
         given: bool[M] whether a person gave an action.
         action: f32[M, A] that action; 0 where there is none.
-        confirmed: bool[M] whether a person wants the hard reset of the robot to go on.
+        confirmed: bool[M] whether a person confirmed the hard reset of the robot.
     """
 
     seat: np.ndarray

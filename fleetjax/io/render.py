@@ -16,10 +16,10 @@ import numpy as np
 from fleetjax import envs
 from fleetjax.allocation import helper_of
 from fleetjax.config import Config
+from fleetjax.experiment import evaluate, prepare, run, without_teleoperation
 from fleetjax.fleet import FleetState, make_fleet
 from fleetjax.keys import key_at
 from fleetjax.learning.imitation import PolicyState
-from fleetjax.run import evaluate, prepare, run, without_teleoperation
 from fleetjax.types import EnvState
 
 FORMATS = (".gif", ".mp4")
@@ -70,17 +70,17 @@ def check(config: Config) -> None:
         check_gl()
 
 
-def start(config: Config, key: jax.Array, learner: PolicyState | None, *, skip: int) -> tuple[Config, FleetState]:
-    """Return the state in which a film begins, and the configuration to go on with.
+def start(config: Config, key: jax.Array, policy: PolicyState | None, *, skip: int) -> tuple[Config, FleetState]:
+    """Return the configuration of a film, and the state in which it begins.
 
     Args:
         config: configuration.
         key: random key.
-        learner: a trained policy that acts alone; None pre-trains, and humans help.
+        policy: a trained policy that acts alone; None pre-trains, and humans help.
         skip: timesteps to run first.
     """
-    if learner is not None:
-        state = jax.jit(evaluate)(config.replace(num_steps=max(1, skip)), key, learner).state
+    if policy is not None:
+        state = jax.jit(evaluate)(config.replace(num_steps=max(1, skip)), key, policy).state
         return without_teleoperation(config), state
     state = jax.jit(prepare)(config, key)
     return config, jax.jit(run)(config.replace(num_steps=skip), key, state).state if skip else state

@@ -1,6 +1,6 @@
 """MuJoCo's C engine behind the physics contract: a thread pool, reached from JAX by a callback.
 
-The whole batch of robots crosses to the host once a control step. Robots that stand still are left out, and
+The whole batch of robots crosses to the host once a control step. Robots that stand still are skipped, and
 a diverged robot (MuJoCo resets it or stops it early) is recognised by its clock.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from mujoco import rollout
 
-from fleetjax.physics.base import PhysicsState, contain_divergence
+from fleetjax.physics.contract import PhysicsState, contain_divergence
 
 
 def num_threads() -> int:

@@ -29,7 +29,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="replace")  # a name may hold characters that its encoding lacks
     try:
         arguments = flags.parse(sys.argv[1:] if argv is None else argv)
-        from fleetjax import commands  # imported on demand: JAX takes a second to load, and help needs none of it
+        from fleetjax.io import commands  # imported on demand: JAX takes a second to load, and help needs none of it
 
         commands.COMMANDS[arguments.command](arguments)
     except (Refusal, OSError) as error:

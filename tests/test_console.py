@@ -59,9 +59,7 @@ def crash(fleet: Engine, *robots: int) -> None:
 def test_simulated_seats_give_the_librarys_run():
     fleet = make_engine()
     rows = [take(fleet, inputs(SIMULATED))[1] for _ in range(SMALL["num_steps"])]
-    jax.config.update("jax_disable_most_optimizations", True)
     whole = jax.jit(fleetjax.run)(make_config(), jax.random.key(0)).metrics
-    jax.config.update("jax_disable_most_optimizations", False)
     assert whole.hard_resets.sum() > 0
     assert whole.successes.sum() + whole.teleop_steps.sum() > 0
     for name, stepped, expected in zip(whole._fields, zip(*rows, strict=True), whole, strict=True):

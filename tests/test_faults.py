@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 import toy_envs
+from compiling import compiled
 from reference import recording
-from reference.recording import quick_jit
 
 import fleetjax
 from fleetjax import allocation, fleet
@@ -220,7 +220,7 @@ def start(algorithm: str) -> tuple[fleetjax.Config, fleetjax.FleetState]:
         num_demonstrations=4,
         critic_capacity=1000,
     )
-    return config, quick_jit(lambda key: recording.start(config, ENV, key))(jax.random.key(4))
+    return config, compiled(lambda key: recording.start(config, ENV, key))(jax.random.key(4))
 
 
 def run_against_the_oracle(algorithm: str, make: Callable[[fleetjax.Config, Env], Fleet]) -> recording.Trace:
@@ -230,7 +230,7 @@ def run_against_the_oracle(algorithm: str, make: Callable[[fleetjax.Config, Env]
     def run(config, first, key):
         return recording.record(config, ENV, make(config, ENV), first, key, absence=0.05, silence=0.2)
 
-    trace = quick_jit(run)(config, first, jax.random.key(0))
+    trace = compiled(run)(config, first, jax.random.key(0))
     recording.compare(config, ENV, trace)
     return trace
 

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from commands import TINY, edit_config, shapes_of
+from compiling import compiled
 from hypothesis import strategies as st
-from reference.recording import quick_jit
 
 import fleetjax
 from fleetjax import cli
@@ -146,7 +146,7 @@ def program():
         kept = (result.state.humans, result.state.env, result.state.human_data.pairs.added, result.state.resetting)
         return result.metrics, kept
 
-    return quick_jit(run)
+    return compiled(run)
 
 
 @pytest.mark.parametrize(("algorithm", "shape"), SHAPES, ids=[algorithm for algorithm, _ in SHAPES])

@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+import pytest
 from compiling import compiled
 
 import fleetjax
@@ -34,6 +35,7 @@ def run_navigation():
     return jax.device_get((result.metrics, frozen.metrics))
 
 
+@pytest.mark.slow
 def test_a_run_in_64_bits_is_that_in_32():
     narrow = run_navigation()
     with jax.enable_x64(True):

@@ -78,6 +78,7 @@ def steps_of(path: Path) -> list[int]:
     return sorted(int(found.parent.name) for found in (path / checkpoint.FOLDER).glob(f"*/{checkpoint.MANIFEST}"))
 
 
+@pytest.mark.slow
 def test_an_undisturbed_run_is_the_librarys_bit_for_bit(whole):
     run = folder.read_run(whole)
     expected = jax.jit(fleetjax.run)(run.config, jax.random.key(3))

@@ -1,6 +1,5 @@
 """Runs a fleet, writes down what the NumPy oracle must be told, and compares the two step by step."""
 
-import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -17,10 +16,6 @@ from fleetjax.learning.networks import Normalizer
 from fleetjax.metrics import Metrics, rohe
 from fleetjax.types import EnvState, HumanState, Plan
 from reference import oracle
-
-# Tests compile more than they compute: with these, XLA compiles a fleet in a quarter of the time.
-_OPTIONS = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-quick_jit = functools.partial(jax.jit, compiler_options=_OPTIONS)
 
 # Bound here, so that a fault seeded in the fleet's own tie-breaking does not reach what is recorded.
 draw_order = allocation.tie_order

@@ -21,13 +21,13 @@ from fleetjax.io import flags
 from fleetjax.physics.base import MODELS, PhysicsState
 from fleetjax.physics.native import num_threads
 
-# Substeps of a control step, and `(action, model) -> controls`.
+# Substeps of a control step, and `(end of the observation, model) -> controls`: what the servos or motors were last told.
 ROBOTS: dict[str, tuple[int, Callable[[jax.Array, mujoco.MjModel], jax.Array]]] = {
     "humanoid": (humanoid.SUBSTEPS, lambda action, model: action),
     "anymal": (anymal.SUBSTEPS, lambda action, model: anymal.targets(action)),
     "allegro_hand": (
         allegro_hand.SUBSTEPS,
-        lambda action, model: allegro_hand.targets(action, *jnp.float32(model.jnt_range[:16].T)),
+        lambda target, model: allegro_hand.angles(target, *jnp.float32(model.jnt_range[:16].T)),
     ),
 }
 

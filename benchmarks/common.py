@@ -6,7 +6,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Collection
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -143,30 +143,59 @@ def matrix_rate(size: int = 1024, products: int = 10) -> Callable[[], float]:
     return lambda: 2 * size**3 * products / seconds(multiply, a)[0]
 
 
-def dense_weights(sizes: list[int]) -> list[int]:
-    """Return the number of weights of each dense layer between the given sizes."""
-    return [a * b for a, b in itertools.pairwise(sizes)]
+class Product(NamedTuple):
+    """A matrix product f32[rows, inner] @ f32[inner, columns], `batch` times."""
+
+    batch: int
+    rows: int
+    inner: int
+    columns: int
+
+    @property
+    def operations(self) -> int:
+        """Multiplications and additions."""
+        return 2 * self.batch * self.rows * self.inner * self.columns
 
 
-def gradient_step_operations(config: fleetjax.Config, spec: fleetjax.EnvSpec) -> int:
-    """Return the multiplications and additions that a C.U.R. gradient step cannot do without.
+def gradient_step_products(config: fleetjax.Config, spec: fleetjax.EnvSpec) -> list[Product]:
+    """Return the matrix products that a C.U.R. gradient step cannot do without.
 
-    A product with W weights costs 2 W a sample forwards, 2 W for the weights' gradient, and 2 W for the inputs' (which
-    the first layer does not need).
+    A dense layer costs one product forwards, one for the gradient of its weights, and one for that of its inputs, which the
+    first layer does not need.
     """
-    policy = dense_weights([spec.observation_size, *config.hidden_sizes, spec.action_size])
-    critic = dense_weights([spec.observation_size + spec.action_size, *config.hidden_sizes, 1])
+    policy = list(itertools.pairwise([spec.observation_size, *config.hidden_sizes, spec.action_size]))
+    critic = list(itertools.pairwise([spec.observation_size + spec.action_size, *config.hidden_sizes, 1]))
+    members, twins, samples = config.ensemble_size, 2, config.batch_size
 
-    def forward(layers: list[int]) -> int:
-        return 2 * sum(layers)
+    def forward(batch: int, layers: list[tuple[int, int]]) -> list[Product]:
+        return [Product(batch, samples, i, o) for i, o in layers]
 
-    def gradient(layers: list[int]) -> int:
-        return forward(layers) + 2 * sum(layers) + 2 * sum(layers[1:])
+    def gradient(batch: int, layers: list[tuple[int, int]]) -> list[Product]:
+        weights = [Product(batch, i, samples, o) for i, o in layers]
+        return forward(batch, layers) + weights + [Product(batch, samples, o, i) for i, o in layers[1:]]
 
-    members, twins = config.ensemble_size, 2
-    imitation = members * gradient(policy)
-    safety = members * forward(policy) + twins * (forward(critic) + gradient(critic))
-    return config.batch_size * config.gradient_steps * (imitation + safety)
+    imitation = gradient(members, policy)
+    safety = forward(members, policy) + forward(twins, critic) + gradient(twins, critic)
+    return (imitation + safety) * config.gradient_steps
+
+
+def product_timer(product: Product, repeats: int = 20) -> Callable[[], float]:
+    """Return a function that measures the seconds of a product, in a batch or one by one, whichever is faster."""
+    key_left, key_right = jax.random.split(jax.random.key(0))
+    left = jax.random.normal(key_left, (product.batch, product.rows, product.inner))
+    right = jax.random.normal(key_right, (product.batch, product.inner, product.columns))
+
+    def again(multiply: Callable[[jax.Array, jax.Array], jax.Array]) -> Callable[[], float]:
+        def body(total: jax.Array, _: None) -> tuple[jax.Array, None]:
+            operands, total = jax.lax.optimization_barrier(((left, right), total))  # else XLA would multiply only once
+            return total + jax.lax.optimization_barrier(multiply(*operands))[0, 0, 0], None
+
+        program = jax.jit(lambda: jax.lax.scan(body, jnp.float32(0), length=repeats)[0])
+        jax.block_until_ready(program())
+        return lambda: seconds(program)[0] / repeats
+
+    timers = again(jnp.matmul), again(lambda a, b: jax.lax.map(lambda pair: pair[0] @ pair[1], (a, b)))
+    return lambda: min(timer() for timer in timers)
 
 
 def table(rows: list[dict[str, Any]]) -> str:

@@ -1,4 +1,4 @@
-"""Kills a run again and again, goes on with it, and compares the result with that of a run that nobody disturbed.
+"""Kill a run again and again, resume it, and compare its result with that of an uninterrupted run.
 
     python benchmarks/soak.py --kills 20
     python benchmarks/soak.py --minutes 60 --environment humanoid -- --num-steps 2000
@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 RESULTS = ("metrics.csv", "policy.msgpack", "interventions.bin")
-FROM = re.compile(r"going on from .*/(\d+)")
+FROM = re.compile(r"resuming from .*/(\d+)")
 
 
 def start(arguments: list[str], programs: Path) -> subprocess.Popen[str]:
@@ -80,14 +80,14 @@ def main() -> None:
                 process = start(arguments, work / "programs")
                 kills += kill(process, killed, rng, until=before + rng.uniform(0, timesteps(whole) / 4))
                 _, said = process.communicate()
-                going_on = FROM.search(said)
-                if going_on:
+                resuming = FROM.search(said)
+                if resuming:
                     resumed += 1
-                    lost += before - int(going_on[1])
-                elif "from the start" in said:
+                    lost += before - int(resuming[1])
+                elif "starting from t = 0" in said:
                     lost += before
                 if process.returncode == 0:
-                    assert going_on or "from the start" in said or arguments[0] != "--resume", said
+                    assert resuming or "starting from t = 0" in said or arguments[0] != "--resume", said
                     break
                 assert process.returncode == -9, said
                 if (killed / "config.json").exists():

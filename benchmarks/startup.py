@@ -18,18 +18,18 @@ CHILD = """
 import time; begin = time.perf_counter()
 import json, resource, sys
 import jax, fleetjax
-from fleetjax.io import execution
+from fleetjax.io import chunks
 imported = time.perf_counter()
 compiling = []
 jax.monitoring.register_event_duration_secs_listener(
     lambda event, seconds, **_: compiling.append(seconds) if event.endswith("backend_compile_duration") else None)
 config = fleetjax.make_config(sys.argv[1], "cur", **json.loads(sys.argv[3]))
 key = jax.random.key(0)
-length = execution.chunk_length(config.num_steps)
-state = jax.block_until_ready(execution.start(config, key, length))
+length = chunks.chunk_length(config.num_steps)
+state = jax.block_until_ready(chunks.start(config, key, length))
 ready = time.perf_counter()
-chunks = [length] * -(-int(sys.argv[2]) // length)
-for _ in execution.go_on(config, key, state, chunks):
+lengths = [length] * -(-int(sys.argv[2]) // length)
+for _ in chunks.run_chunks(config, key, state, lengths):
     pass
 peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
 print(json.dumps({"environment": sys.argv[1], "import s": imported - begin, "compilation s": sum(compiling),

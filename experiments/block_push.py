@@ -2,7 +2,7 @@
 
     python experiments/block_push.py [--seeds 0 1 2] [--output runs/block_push] [-- PARAMETERS]
 
-A run takes minutes on two cores. Finished runs are not run again: stop it at any time, and start it anew.
+A run takes minutes on two cores. Finished runs are not run again: stop it at any time, and start it again.
 
 Reference: paper, Section 5.3.
 """

@@ -2,7 +2,7 @@
 
     python experiments/first_look.py [--environments humanoid anymal ...] [--output runs/first_look] [-- PARAMETERS]
 
-A run takes minutes on two cores. Finished runs are not run again: stop it at any time, and start it anew.
+A run takes minutes on two cores. Finished runs are not run again: stop it at any time, and start it again.
 """
 
 from pathlib import Path

@@ -3,7 +3,7 @@
     for seed in 0 1 2; do fleetjax run humanoid --seed $seed --output runs/humanoid-cur-$seed; done
     python experiments/human_time.py runs/humanoid-cur-*
 
-The mean goes to `CUR_HUMAN_TIME` in `fleetjax/envs/__init__.py`, the threshold to the defaults of the environment there.
+The mean goes to `CUR_HUMAN_TIME` in `fleetjax/environments.py`, the threshold to the defaults of the environment there.
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """Train the expert policy of a physics environment with brax PPO; kill it at any time and start it again.
 
-    python experiments/train_expert.py humanoid                 # train, or go on from the last checkpoint
+    python experiments/train_expert.py humanoid                 # train, or resume from the last checkpoint
     python experiments/train_expert.py humanoid --ship           # score the best checkpoints, write the package's weights
 
 Every evaluation appends a row to `curve.csv` and writes a checkpoint (observation statistics, policy and value
@@ -179,7 +179,7 @@ def train_stage(task: Task, folder: Path, *, num_timesteps: int, evaluate_every:
         last = checkpoints(folder)[-1]
         statistics, policy, value = serialization.from_bytes(template(task), last.read_bytes())
         restore = (statistics, set_noise(policy, task.stage.noise) if task.stage.noise else policy, value)
-        print(f"going on from {last} at {done:,} steps")
+        print(f"resuming from {last} at {done:,} steps")
     start = time.time()
 
     def save(step: int, _, params) -> None:

@@ -1,19 +1,25 @@
 """fleetjax: interactive fleet learning in JAX. N robots, M humans: who gets help, and what does the fleet gain?"""
 
-from fleetjax import envs
-from fleetjax.allocation import allocate
-from fleetjax.config import Config, make_config, validate
-from fleetjax.envs import Env, EnvSpec, list_envs, register_env
-from fleetjax.envs.checking import check_env
-from fleetjax.field import Field
-from fleetjax.fleet import Fleet, FleetState, make_fleet
-from fleetjax.learning.estimators import Estimator, Step, register_estimator
-from fleetjax.metrics import Metrics, first_divergence, rohe
-from fleetjax.priority import Algorithm, Priority, list_algorithms, register_algorithm, register_priority
-from fleetjax.run import Result, evaluate, extend, prepare, run, run_logged
-from fleetjax.supervisors import Supervisor, list_supervisors, register_supervisor
-from fleetjax.types import EnvState, HumanState, Interventions, Plan, Signals
+import importlib
+import importlib.util
+from typing import TYPE_CHECKING, Any
+
 from fleetjax.version import VERSION
+
+if TYPE_CHECKING:
+    from fleetjax import envs
+    from fleetjax.allocation import allocate
+    from fleetjax.config import Config, make_config, validate
+    from fleetjax.envs import Env, EnvSpec, list_envs, register_env
+    from fleetjax.envs.checking import check_env
+    from fleetjax.experiment import Result, evaluate, extend, prepare, run, run_logged
+    from fleetjax.field import Field
+    from fleetjax.fleet import Fleet, FleetState, make_fleet
+    from fleetjax.learning.estimators import Estimator, Step, register_estimator
+    from fleetjax.metrics import Metrics, first_divergence, rohe
+    from fleetjax.priority import Algorithm, Priority, list_algorithms, register_algorithm, register_priority
+    from fleetjax.supervisors import Supervisor, list_supervisors, register_supervisor
+    from fleetjax.types import EnvState, HumanState, Interventions, Plan, Signals
 
 __version__ = VERSION
 __all__ = [
@@ -57,3 +63,34 @@ __all__ = [
     "run_logged",
     "validate",
 ]
+
+# The names of each module. It is imported when the first of them is used: JAX takes a second to load, and the help of the
+# command line does without.
+_NAMES = {
+    "allocation": ["allocate"],
+    "config": ["Config", "make_config", "validate"],
+    "envs": ["Env", "EnvSpec", "list_envs", "register_env"],
+    "envs.checking": ["check_env"],
+    "experiment": ["Result", "evaluate", "extend", "prepare", "run", "run_logged"],
+    "field": ["Field"],
+    "fleet": ["Fleet", "FleetState", "make_fleet"],
+    "learning.estimators": ["Estimator", "Step", "register_estimator"],
+    "metrics": ["Metrics", "first_divergence", "rohe"],
+    "priority": ["Algorithm", "Priority", "list_algorithms", "register_algorithm", "register_priority"],
+    "supervisors": ["Supervisor", "list_supervisors", "register_supervisor"],
+    "types": ["EnvState", "HumanState", "Interventions", "Plan", "Signals"],
+}
+_MODULES = {name: module for module, names in _NAMES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    """Return a public name, or a module of the package."""
+    if name in _MODULES:
+        return getattr(importlib.import_module(f"fleetjax.{_MODULES[name]}"), name)
+    if not name.startswith("_") and importlib.util.find_spec(f"fleetjax.{name}"):
+        return importlib.import_module(f"fleetjax.{name}")
+    raise AttributeError(f"module 'fleetjax' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

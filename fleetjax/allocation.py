@@ -58,7 +58,7 @@ def allocate(
 
     competing = jnp.where(score > 0, score, 0.0)  # a NaN is not > 0
     competing = competing.at[jnp.where(bound, humans.robot, num_robots)].set(0.0, mode="drop")
-    order = jax.random.permutation(key, num_robots)
+    order = tie_order(key, num_robots)
     best, rank = jax.lax.top_k(competing[order], min(num_humans, num_robots))
     chosen = order[rank]
     is_chosen = (best > 0) & (jnp.arange(chosen.size) < jnp.sum(unlocked))
@@ -76,6 +76,11 @@ def allocate(
     keeps = bound | stays
     robot = jnp.where(keeps, humans.robot, jnp.where(waiting, queue[turn], nobody))
     return HumanState(robot=robot, duration=jnp.where(keeps, humans.duration, 0))
+
+
+def tie_order(key: jax.Array, num_robots: int) -> jax.Array:
+    """Return i32[N], the robots in random order."""
+    return jnp.argsort(jax.random.bits(key, (num_robots,)))  # one draw, where `jax.random.permutation` splits the key first
 
 
 def helper_of(humans: HumanState, num_robots: int) -> jax.Array:

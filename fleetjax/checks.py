@@ -38,29 +38,36 @@ def state_shapes(config: Config, env: Env) -> FleetState:
     return jax.eval_shape(blank, config, jax.random.key(0))
 
 
-def check_run(config: Config, env: Env | None = None) -> Env:
+def check_run(config: Config, env: Env | None = None, state: FleetState | None = None) -> Env:
     """Check all that can be checked before a run is computed; return its environment.
 
     Args:
         config: configuration.
         env: the environment, if it is not the registered one that the configuration names.
+        state: the state to start from, if there is one.
 
     Raises:
-        ValueError: if the configuration is not valid, or the run cannot fit the memory.
+        ValueError: if the configuration is not valid, the run cannot fit the memory, or it cannot start from the state.
     """
     validate(config, env)
     env = env or envs.make(config.environment, config.backend)
-    check_memory(config, env)
+    shapes = state_shapes(config, env)
+    check_memory(config, shapes)
+    if state is not None:
+        check_state(config, env, state, shapes)
     return env
 
 
-def check_memory(config: Config, env: Env) -> None:
+def check_memory(config: Config, state: FleetState) -> None:
     """Check that the arrays that a run cannot do without fit the memory.
+
+    Args:
+        config: configuration.
+        state: shapes of the fleet's state.
 
     Raises:
         ValueError: if they do not; the message has the estimate, the memory there is, and the field to reduce.
     """
-    state = state_shapes(config, env)
     learnt = jax.tree.leaves(state.estimators, is_leaf=lambda x: isinstance(x, Buffer))
     stores = [x for x in learnt if isinstance(x, Buffer)]
     parts = {
@@ -75,7 +82,7 @@ def check_memory(config: Config, env: Env) -> None:
         largest = max(parts, key=lambda name: parts[name])
         raise ValueError(
             f"{largest} = {getattr(config, largest)} is too large: the run needs at least {needed / _GIB:,.2f} GiB of memory, "
-            f"{parts[largest] / _GIB:,.2f} of them for this, and there are {limit / _GIB:,.2f}"
+            f"{parts[largest] / _GIB:,.2f} of them for this, but only {limit / _GIB:,.2f} are available"
         )
 
 
@@ -93,8 +100,14 @@ def _memory() -> int:
     return min([machine, *(int(limit) for limit in limits if limit.isdecimal())])
 
 
-def check_state(config: Config, env: Env, state: FleetState) -> None:
+def check_state(config: Config, env: Env, state: FleetState, shapes: FleetState) -> None:
     """Check that a run can start from a state.
+
+    Args:
+        config: configuration.
+        env: the environment.
+        state: where to start.
+        shapes: what the state must look like.
 
     Raises:
         ValueError: if the state is another environment's, algorithm's or fleet's, or (where its numbers are concrete) has no
@@ -103,15 +116,15 @@ def check_state(config: Config, env: Env, state: FleetState) -> None:
     made = state.origin
     if made.environment not in ("", env.spec.name):
         raise ValueError(
-            f"environment = {env.spec.name!r}, and the state was prepared for {made.environment!r}; prepare one for it"
+            f"environment = {env.spec.name!r}, but the state was prepared for {made.environment!r}; prepare one for it"
         )
     if state.resetting.ndim != 1:
         raise ValueError("the state holds several fleets; use jax.vmap or jax.lax.map over them")
     sizes = {"num_robots": state.resetting.shape[0], "num_humans": state.humans.robot.shape[0]}
     for name, found in sizes.items():
         if found != getattr(config, name):
-            raise ValueError(f"{name} = {getattr(config, name)}, and the state was prepared for {found}; prepare one for it")
-    wanted, given = _layout(state_shapes(config, env)), _layout(state)
+            raise ValueError(f"{name} = {getattr(config, name)}, but the state was prepared for {found}; prepare one for it")
+    wanted, given = _layout(shapes), _layout(state)
     if jax.tree.structure(wanted) != jax.tree.structure(given):
         raise ValueError(
             f"algorithm = {config.algorithm!r} keeps other estimators or another memory than {made.algorithm!r}, for which the "
@@ -120,8 +133,8 @@ def check_state(config: Config, env: Env, state: FleetState) -> None:
     for (path, found), leaf in zip(jax.tree_util.tree_leaves_with_path(given), jax.tree.leaves(wanted), strict=True):
         if (found.shape, found.dtype) != (leaf.shape, leaf.dtype):
             raise ValueError(
-                f"the state does not fit the configuration: its {jax.tree_util.keystr(path)} is {_shown(found)}, and "
-                f"{_shown(leaf)} is wanted; prepare one for it"
+                f"the state does not fit the configuration: its {jax.tree_util.keystr(path)} is {_shown(found)}; "
+                f"expected {_shown(leaf)}; prepare one for it"
             )
     _check_room(config, state)
 
@@ -156,6 +169,6 @@ def _check_room(config: Config, state: FleetState) -> None:
     missing = stored + taught_pairs(config) - pairs.capacity
     if missing > 0:
         raise ValueError(
-            f"num_steps = {config.num_steps} can give {taught_pairs(config)} human pairs, and the state has room for "
+            f"num_steps = {config.num_steps} can produce {taught_pairs(config)} human pairs, but the state has room for "
             f"{pairs.capacity - stored} more; make room with fleetjax.extend(state, {missing})"
         )

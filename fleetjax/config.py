@@ -1,7 +1,6 @@
-"""Every parameter of a run: its meaning, unit, default, and whether changing it compiles anew.
+"""The configuration of a run: the values of its parameters, which `field.py` declares.
 
-Static fields shape the program. Traced fields are arrays: `vmap` over them sweeps them in one compilation. Defaults are the
-paper's (Section 5.2 and Appendix); environments change some of them, see `fleetjax.envs.get_defaults`.
+Static fields shape the program. Traced fields are arrays: `vmap` over them sweeps them in one compilation.
 """
 
 import dataclasses
@@ -14,64 +13,19 @@ import numpy as np
 from jax.core import Tracer
 
 from fleetjax import envs, priority, supervisors
-from fleetjax.field import Field
+from fleetjax.field import FIELDS, Field, Fields, owners
 from fleetjax.physics.base import BACKENDS
 from fleetjax.registry import unknown
 
 
-def _static(default: Any, help: str, unit: str = "", *, low: float | None = None) -> Any:
-    field = Field(help, unit, type(default), False, low, None, default)
-    return dataclasses.field(default=default, metadata={"field": field})
-
-
-def _traced(default: Any, help: str, unit: str = "", *, low: float | None = 0, high: float | None = None) -> Any:
-    field = Field(help, unit, type(default), True, low, high, default)
-    return dataclasses.field(default=default, metadata={"field": field})
-
-
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(Fields):
     """Parameters of a run. Make one with `make_config`; change one with `replace`.
 
     Attributes:
         parameters: the algorithm's own, by name: f32, i32 or bool scalars, traced.
         capacity_given: whether `human_capacity` was set explicitly; otherwise it is derived from the other fields.
     """
-
-    environment: str = _static("humanoid", "registered environment")
-    algorithm: str = _static("cur", "registered algorithm, or an order of the letters c, u, r")
-    supervisor: str = _static("", "registered supervisor; empty = the environment's own")
-    backend: str = _static("auto", "physics backend: native (CPU threads), mjx (pure JAX), auto")
-    num_robots: int = _static(100, "robots N", low=1)
-    num_humans: int = _static(10, "human supervisors M, at most N", low=1)
-    num_steps: int = _static(10_000, "operation time T", "timesteps", low=1)
-    ensemble_size: int = _static(5, "networks in the policy ensemble E (discrete actions: 1)", low=1)
-    hidden_sizes: tuple[int, ...] = _static((256, 256), "units of the hidden layers of policy and critics")
-    batch_size: int = _static(256, "samples a gradient step", low=1)
-    gradient_steps: int = _static(1, "gradient steps a timestep", low=0)
-    augmented_copies: int = _static(1, "copies kept of each human pair; if more than 1, their images are augmented", low=1)
-    human_capacity: int = _static(0, "room for human data; 0 = all that a run can give", "pairs", low=0)
-    critic_capacity: int = _static(250_000, "room of the ring of critic data, at least N", "transitions", low=1)
-
-    min_teleop_time: int = _traced(5, "shortest teleoperation t_T", "timesteps", low=1)
-    hard_reset_time: int = _traced(5, "duration of a hard reset t_R", "timesteps", low=1)
-    initial_period: int = _traced(0, "time t_I before orders with C help robots in violation", "timesteps")
-    uncertainty_threshold: float = _traced(0.05, "uncertainty below which U is 0; in nats where actions are discrete")
-    risk_threshold: float = _traced(0.5, "risk below which R is 0", high=1)
-    learning_rate: float = _traced(3e-4, "Adam's learning rate, policy and critics")
-    normalize_observations: bool = _traced(
-        True, "scale observations by the demonstrations' mean and deviation (images: always alike)"
-    )
-    num_demonstrations: int = _traced(5000, "offline pairs from whole supervisor episodes", "pairs", low=1)
-    extra_demonstrations: int = _traced(0, "offline pairs on top (the constraint baseline)", "pairs")
-    pretraining_steps: int = _traced(1000, "gradient steps on the demonstrations", "gradient steps")
-    critic_pretraining_steps: int = _traced(3000, "gradient steps on the offline transitions", "gradient steps")
-    num_critic_transitions: int = _traced(20_000, "offline transitions for the critic", "transitions")
-    critic_noise: float = _traced(0.25, "deviation of the noise on actions in those transitions")
-    positive_fraction: float = _traced(0.25, "share of positives in a critic batch", high=1)
-    risk_discount: float = _traced(0.5, "discount of the safety critic", high=1)
-    goal_discount: float = _traced(0.999, "discount of the goal critic", high=1)
-    target_rate: float = _traced(2e-4, "rate at which target networks follow, each gradient step", high=1)
 
     parameters: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     capacity_given: bool = False
@@ -97,7 +51,6 @@ class Config:
         return _with_capacity(self, dataclasses.replace(self, **typed, parameters=own), changes)
 
 
-FIELDS: dict[str, Field] = {f.name: f.metadata["field"] for f in dataclasses.fields(Config) if "field" in f.metadata}
 _LARGEST = 2**31 - 1
 _LARGEST_EXACT = 2**24  # beyond it f32 skips whole numbers
 _OFFLINE = ("num_demonstrations", "extra_demonstrations")
@@ -115,19 +68,6 @@ def all_fields(algorithm: str) -> dict[str, Field]:
     return FIELDS | dict(priority.get_algorithm(algorithm).parameters)
 
 
-def every_field() -> dict[str, Field]:
-    """Return the fields of `Config` and the parameters of all registered algorithms, by name."""
-    own = {
-        name: field for other in priority.list_algorithms() for name, field in priority.get_algorithm(other).parameters.items()
-    }
-    return own | FIELDS
-
-
-def owners(name: str) -> tuple[str, ...]:
-    """Return the algorithms that have a parameter of this name."""
-    return tuple(other for other in priority.list_algorithms() if name in priority.get_algorithm(other).parameters)
-
-
 def get_value(config: Config, name: str) -> Any:
     """Return the value of a field, or of a parameter of the algorithm."""
     return getattr(config, name) if name in FIELDS else config.parameters[name]
@@ -138,7 +78,7 @@ def _not_known(name: str, algorithm: str) -> str:
     others = owners(name)
     if others:
         have = ", ".join(map(repr, others))
-        return f"{name} is a parameter of algorithm = {have}, and not of {algorithm!r}; leave it out, or choose that algorithm"
+        return f"{name} is a parameter of algorithm = {have}, not of {algorithm!r}; omit it, or choose that algorithm"
     return unknown("config field", name, all_fields(algorithm))
 
 
@@ -258,7 +198,7 @@ def _with_capacity(before: Config, after: Config, changes: Mapping[str, Any]) ->
     for name in _OFFLINE:
         if name in changes and not _is_concrete(getattr(after, name)):
             raise ValueError(
-                f"{name} is traced, so the room for human data cannot follow from it; pass human_capacity as well, the most "
+                f"{name} is traced, so the room for human data is not known; pass human_capacity as well, the most "
                 f"pairs that a run can hold: the largest number of demonstrations and {taught_pairs(after)} of teleoperation"
             )
     longer = max(0, taught_pairs(after) - taught_pairs(before))
@@ -290,6 +230,9 @@ def make_config(environment: "str | envs.Env", algorithm: str = "cur", **overrid
         if override not in known:
             raise ValueError(_not_known(override, algorithm))
     of_place = {key: value for key, value in defaults.items() if key in known}
+    spec = (env or envs.make(name, overrides.get("backend", "auto"))).spec
+    if spec.success_return is not None:
+        of_place["success_return"] = spec.success_return
     of_field = {key: field.default for key, field in known.items()}
     config = Config().replace(**of_field | of_place | {"environment": name, "algorithm": algorithm} | overrides)
     of_algorithm = priority.get_algorithm(algorithm).defaults(config)
@@ -364,7 +307,7 @@ def _check_data(config: Config, algorithm: priority.Algorithm) -> None:
     needed = needed_human_capacity(config)
     if max(needed, config.human_capacity) > _LARGEST:
         raise ValueError(
-            f"human_capacity = {needed} pairs, which this run can give, must lie within 32 bits; shorten num_steps"
+            f"human_capacity = {needed} pairs, which this run can produce, must lie within 32 bits; shorten num_steps"
         )
     if config.human_capacity < needed:
-        raise ValueError(f"human_capacity = {config.human_capacity} is less than the {needed} pairs that this run can give")
+        raise ValueError(f"human_capacity = {config.human_capacity} is less than the {needed} pairs that this run can produce")

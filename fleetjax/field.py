@@ -1,5 +1,12 @@
-"""What is known of a parameter of a run: its meaning, unit, default and range."""
+"""Every parameter of a run: its meaning, unit, default, range, and whether changing it compiles again.
 
+The defaults are the paper's (Section 5.2 and Appendix); environments change some of them, see `fleetjax.envs.get_defaults`. The
+help of the command line is made from these tables, without loading JAX.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 
@@ -10,7 +17,7 @@ class Field(NamedTuple):
         help: meaning.
         unit: unit, or "".
         kind: `str`, `int`, `float`, `bool` or `tuple`.
-        traced: whether it is an array that can be swept without compiling anew; an algorithm's own parameters always are.
+        traced: whether it is an array that can be swept without compiling again; an algorithm's own parameters always are.
         low: smallest allowed value.
         high: largest allowed value.
         default: value unless another is given.
@@ -23,3 +30,87 @@ class Field(NamedTuple):
     low: float | None = 0
     high: float | None = None
     default: Any = 0.0
+
+
+def _static(default: Any, help: str, unit: str = "", *, low: float | None = None) -> Any:
+    field = Field(help, unit, type(default), False, low, None, default)
+    return dataclasses.field(default=default, metadata={"field": field})
+
+
+def _traced(default: Any, help: str, unit: str = "", *, low: float | None = 0, high: float | None = None) -> Any:
+    field = Field(help, unit, type(default), True, low, high, default)
+    return dataclasses.field(default=default, metadata={"field": field})
+
+
+@dataclasses.dataclass(frozen=True)
+class Fields:
+    """The parameters that every run has. Static ones shape the program, traced ones are arrays."""
+
+    environment: str = _static("humanoid", "registered environment")
+    algorithm: str = _static("cur", "registered algorithm, or an order of the letters c, u, r")
+    supervisor: str = _static("", "registered supervisor; empty = the environment's own")
+    backend: str = _static("auto", "physics backend: native (CPU threads), mjx (pure JAX), auto")
+    num_robots: int = _static(100, "robots N", low=1)
+    num_humans: int = _static(10, "human supervisors M, at most N", low=1)
+    num_steps: int = _static(10_000, "operation time T", "timesteps", low=1)
+    ensemble_size: int = _static(5, "networks in the policy ensemble E (discrete actions: 1)", low=1)
+    hidden_sizes: tuple[int, ...] = _static((256, 256), "units of the hidden layers of policy and critics")
+    batch_size: int = _static(256, "samples per gradient step", low=1)
+    gradient_steps: int = _static(1, "gradient steps per timestep", low=0)
+    augmented_copies: int = _static(1, "copies kept of each human pair; if more than 1, their images are augmented", low=1)
+    human_capacity: int = _static(0, "room for human data; 0 = as many as the run can produce", "pairs", low=0)
+    critic_capacity: int = _static(250_000, "room for the critics' data, at least N; the oldest go first", "transitions", low=1)
+
+    min_teleop_time: int = _traced(5, "shortest teleoperation t_T", "timesteps", low=1)
+    hard_reset_time: int = _traced(5, "duration of a hard reset t_R", "timesteps", low=1)
+    initial_period: int = _traced(
+        0, "period t_I at the start in which rules with C leave violating robots waiting", "timesteps"
+    )
+    success_return: float = _traced(
+        0.0, "return above which an episode of full length succeeds, where the environment judges by returns", low=None
+    )
+    uncertainty_threshold: float = _traced(0.05, "uncertainty below which U is 0; in nats where actions are discrete")
+    risk_threshold: float = _traced(0.5, "risk below which R is 0", high=1)
+    learning_rate: float = _traced(3e-4, "Adam's learning rate, policy and critics")
+    normalize_observations: bool = _traced(
+        True, "scale observations by the mean and standard deviation of the demonstrations (images: by a fixed scale)"
+    )
+    num_demonstrations: int = _traced(5000, "offline pairs, from complete supervisor episodes", "pairs", low=1)
+    extra_demonstrations: int = _traced(0, "further offline pairs (the constraint baseline)", "pairs")
+    pretraining_steps: int = _traced(1000, "gradient steps on the demonstrations", "gradient steps")
+    critic_pretraining_steps: int = _traced(3000, "gradient steps on the offline transitions", "gradient steps")
+    num_critic_transitions: int = _traced(20_000, "offline transitions for the critic", "transitions")
+    critic_noise: float = _traced(0.25, "standard deviation of the action noise in those transitions")
+    positive_fraction: float = _traced(0.25, "share of positives in a critic batch", high=1)
+    risk_discount: float = _traced(0.5, "discount of the safety critic", high=1)
+    goal_discount: float = _traced(0.999, "discount of the goal critic", high=1)
+    target_rate: float = _traced(2e-4, "rate at which target networks follow, per gradient step", high=1)
+
+
+FIELDS: dict[str, Field] = {f.name: f.metadata["field"] for f in dataclasses.fields(Fields)}
+
+# The orders of C, U and R, such as C.U.R.
+ORDERS = tuple("".join(letters) for size in (3, 2, 1) for letters in itertools.permutations("cur", size))
+_IDLE = Field(
+    "in the initial period, humans whom nobody else needs teleoperate random robots", kind=bool, high=None, default=False
+)
+
+# The parameters that an algorithm has besides, by its name. `register_algorithm` adds those of others.
+PARAMETERS: dict[str, Mapping[str, Field]] = {
+    "random": {"random_threshold": Field("scores below this become 0", high=1, default=0.9)},
+    "thrifty_dagger": {
+        "thrifty_weight": Field("weight of the chance of failure", high=1, default=0.25),
+        "thrifty_threshold": Field("normalised scores at or below this become 0", default=3.25),
+    },
+    **{letters: {"idle_humans_teleoperate": _IDLE} for letters in ORDERS if "c" in letters},
+}
+
+
+def every_field() -> dict[str, Field]:
+    """Return the fields of `Config` and the parameters of all registered algorithms, by name."""
+    return {name: field for own in PARAMETERS.values() for name, field in own.items()} | FIELDS
+
+
+def owners(name: str) -> tuple[str, ...]:
+    """Return the algorithms that have a parameter of this name."""
+    return tuple(algorithm for algorithm, own in PARAMETERS.items() if name in own)

@@ -17,7 +17,9 @@ from fleetjax import metrics, priority, supervisors
 from fleetjax.allocation import Allocator, helper_of
 from fleetjax.config import Config
 from fleetjax.envs import Env
+from fleetjax.keys import Keys, split_keys
 from fleetjax.learning import buffer, imitation
+from fleetjax.learning.critic import CriticState
 from fleetjax.learning.estimators import ESTIMATORS, Estimator, Step
 from fleetjax.learning.imitation import HumanData, Learner, Pair, PolicyState
 from fleetjax.metrics import Metrics
@@ -84,7 +86,7 @@ class Parts(NamedTuple):
 
 
 class Fleet(NamedTuple):
-    """Pure functions of a fleet. Each timestep has its own key.
+    """Pure functions of a fleet. Each timestep has its own key, which `plan` and `advance` share.
 
     Attributes:
         init: `(key, PolicyState, HumanData, estimators' states) -> FleetState` at t = 0.
@@ -113,18 +115,21 @@ def make_parts(config: Config, env: Env) -> Parts:
 
 def make_fleet(config: Config, env: Env) -> Fleet:
     """Compose environment, policy, estimators, priority, allocator and supervisor into the timestep of a fleet."""
-    parts = make_parts(config, env)
+    parts, n = make_parts(config, env), config.num_robots
+
+    def plan_(state: FleetState, key: jax.Array, available: jax.Array | None = None) -> tuple[FleetState, Plan]:
+        return plan(parts, state, split_keys(key, n), available)
 
     def advance(
         state: FleetState, plan: Plan, human_action: jax.Array, given: jax.Array, key: jax.Array
     ) -> tuple[FleetState, Metrics]:
-        return act(parts, state, plan, human_action, given, key)[:2]
+        return act(parts, state, plan, human_action, given, split_keys(key, n))[:2]
 
     def step(state: FleetState, key: jax.Array) -> tuple[FleetState, Metrics]:
         after, (counts, _) = logged_step(parts, state, key)
         return after, counts
 
-    return Fleet(in_32_bits(partial(init, parts)), in_32_bits(partial(plan, parts)), in_32_bits(advance), in_32_bits(step))
+    return Fleet(in_32_bits(partial(init, parts)), in_32_bits(plan_), in_32_bits(advance), in_32_bits(step))
 
 
 def init(parts: Parts, key: jax.Array, policy: PolicyState, data: HumanData, estimators: dict[str, Any]) -> FleetState:
@@ -132,7 +137,7 @@ def init(parts: Parts, key: jax.Array, policy: PolicyState, data: HumanData, est
     config, n, m = parts.config, parts.config.num_robots, parts.config.num_humans
     return FleetState(
         timestep=jnp.zeros((), jnp.int32),
-        env=reset_robots(parts, key),
+        env=reset_robots(parts, jax.random.split(key, n)),
         humans=HumanState(jnp.full(m, -1, jnp.int32), jnp.zeros(m, jnp.int32)),
         resetting=jnp.zeros(n, bool),
         correction=jnp.zeros(n, jnp.float32),
@@ -146,21 +151,20 @@ def init(parts: Parts, key: jax.Array, policy: PolicyState, data: HumanData, est
 
 def logged_step(parts: Parts, state: FleetState, key: jax.Array) -> tuple[FleetState, tuple[Metrics, Interventions]]:
     """Take a timestep with the simulated supervisor; return also what each human who teleoperated saw and did."""
-    key_plan, key_human, key_advance = jax.random.split(key, 3)
-    state, planned = plan(parts, state, key_plan)
-    human_action = supervise(parts, state.env, key_human)
-    after, counts, stepped = act(parts, state, planned, human_action, planned.teleoperated, key_advance)
+    keys = split_keys(key, parts.config.num_robots)
+    state, planned = plan(parts, state, keys)
+    human_action = supervise(parts, state.env, keys)
+    after, counts, stepped = act(parts, state, planned, human_action, planned.teleoperated, keys)
     return after, (counts, watch(state.env, planned, human_action, stepped))
 
 
-def plan(parts: Parts, state: FleetState, key: jax.Array, available: jax.Array | None = None) -> tuple[FleetState, Plan]:
+def plan(parts: Parts, state: FleetState, keys: Keys, available: jax.Array | None = None) -> tuple[FleetState, Plan]:
     """Decide which human helps which robot: signals, scores, allocation (paper, Section 4)."""
     config = parts.config
-    key_score, key_ties = jax.random.split(key)
-    signals = observe(parts, state, key)
-    score, memory = parts.rule.score(signals, state.priority, key_score)
+    signals = observe(parts, state, keys)
+    score, memory = parts.rule.score(signals, state.priority, keys.score)
     min_time = jnp.where(state.resetting, config.hard_reset_time, config.min_teleop_time)
-    humans = parts.allocate(score, state.humans, min_time, key_ties, available, signals)
+    humans = parts.allocate(score, state.humans, min_time, keys.ties, available, signals)
     helped = helper_of(humans, config.num_robots) >= 0
     resetting, teleoperated = helped & signals.violation, helped & ~signals.violation
     humans = restart_clocks(humans, state.resetting, resetting, config.hard_reset_time)
@@ -168,20 +172,19 @@ def plan(parts: Parts, state: FleetState, key: jax.Array, available: jax.Array |
 
 
 def act(
-    parts: Parts, state: FleetState, planned: Plan, human_action: jax.Array, given: jax.Array, key: jax.Array
+    parts: Parts, state: FleetState, planned: Plan, human_action: jax.Array, given: jax.Array, keys: Keys
 ) -> tuple[FleetState, Metrics, EnvState]:
     """Do what was planned; return also the robots' states after their step, before resets and new goals."""
     chex.assert_shape(human_action, (parts.config.num_robots, parts.env.spec.action_size))
-    key_env, key_reset, key_goal, key_data, key_learn = jax.random.split(key, 5)
     given, moving = given & planned.teleoperated, ~state.env.violation
     action = jnp.where(given[:, None], human_action, planned.robot_action)
-    stepped, sound = step_robots(parts, state.env, action, moving, key_env)
+    stepped, sound = step_robots(parts, state.env, action, moving, keys)
     steps = Step(state.env.obs, action, stepped.obs, stepped.violation, stepped.success, planned.robot_action, given)
     humans = planned.humans._replace(duration=jnp.where(planned.humans.robot >= 0, planned.humans.duration + 1, 0))
     correction = jnp.where(given & sound, jnp.mean((human_action - planned.robot_action) ** 2, axis=-1), 0.0)
-    before, state = state, remember(parts, state, steps, given & sound, moving & sound, key_data)
-    renewed, reset_done = renew(parts, stepped, planned, humans, moving, key_reset, key_goal)
-    state, loss = learn(parts, state, key_learn)
+    before, state = state, remember(parts, state, steps, given & sound, moving & sound, keys)
+    renewed, reset_done = renew(parts, stepped, planned, humans, moving, keys)
+    state, loss = learn(parts, state, keys)
     state = state._replace(
         timestep=before.timestep + 1, env=renewed, humans=humans, resetting=planned.resetting, correction=correction
     )
@@ -190,7 +193,7 @@ def act(
     return state, metrics.measure(parts.config, planned, before.humans, stepped, moving, *learnt), stepped
 
 
-def observe(parts: Parts, state: FleetState, key: jax.Array) -> Signals:
+def observe(parts: Parts, state: FleetState, keys: Keys) -> Signals:
     """Return what rules may look at. What is not finite is 0: one robot must not spoil the ranks."""
     n, obs = parts.config.num_robots, state.env.obs
     action, uncertainty = parts.learner.predict(state.policy, obs)
@@ -211,78 +214,72 @@ def observe(parts: Parts, state: FleetState, key: jax.Array) -> Signals:
         helped=helper >= 0,
         help_time=jnp.where(helper >= 0, state.humans.duration[helper], 0),
         correction=state.correction,
-        human_action=supervise(parts, state.env, jax.random.fold_in(key, 0)) if parts.algorithm.sees_supervisor else None,
+        human_action=supervise(parts, state.env, keys) if parts.algorithm.sees_supervisor else None,
         link=jnp.ones(n, jnp.float32),
     )
 
 
-def supervise(parts: Parts, env: EnvState, key: jax.Array) -> jax.Array:
+def supervise(parts: Parts, env: EnvState, keys: Keys) -> jax.Array:
     """Return f32[N, A], what the simulated supervisor would do on each robot."""
-    return jax.vmap(parts.supervisor.act)(env, jax.random.split(key, parts.config.num_robots))
+    return jax.vmap(parts.supervisor.act)(env, keys.human)
 
 
-def reset_robots(parts: Parts, key: jax.Array) -> EnvState:
-    """Return EnvState[N], each robot drawn from its own initial distribution."""
-    n = parts.config.num_robots
-    return jax.vmap(parts.env.reset)(jax.random.split(key, n), jnp.arange(n))
+def reset_robots(parts: Parts, keys: jax.Array) -> EnvState:
+    """Return EnvState[N], each robot drawn from its own initial distribution by its key of `keys` [N]."""
+    return jax.vmap(parts.env.reset)(keys, jnp.arange(parts.config.num_robots))
 
 
-def step_robots(
-    parts: Parts, env: EnvState, action: jax.Array, moving: jax.Array, key: jax.Array
-) -> tuple[EnvState, jax.Array]:
+def step_robots(parts: Parts, env: EnvState, action: jax.Array, moving: jax.Array, keys: Keys) -> tuple[EnvState, jax.Array]:
     """Step the robots that move; return EnvState[N], and bool[N] whose numbers are finite. The others are in violation."""
-    keys = jax.random.split(key, parts.config.num_robots)
-    stepped = where(moving, jax.vmap(parts.env.step)(env, action, moving, keys), env)
+    stepped = jax.vmap(parts.env.step)(env, action, moving, keys.env)
+    if parts.env.spec.success_return is not None:
+        stepped = stepped._replace(success=stepped.timeout & (stepped.episode_return > parts.config.success_return))
+    stepped = where(moving, stepped, env)
     sound = finite((env.obs, action, stepped.obs, stepped.reward))
     return contain(stepped, sound), sound
 
 
-def remember(parts: Parts, state: FleetState, steps: Step, taught: jax.Array, moved: jax.Array, key: jax.Array) -> FleetState:
+def remember(parts: Parts, state: FleetState, steps: Step, taught: jax.Array, moved: jax.Array, keys: Keys) -> FleetState:
     """Record what humans did where they `taught` bool[N], and what happened where robots `moved` bool[N]."""
     data = state.human_data
     if parts.algorithm.updates:
-        data = parts.learner.append(data, Pair(steps.obs, steps.action), taught, key)
+        data = parts.learner.append(data, Pair(steps.obs, steps.action), taught, keys.data)
     estimators = {name: estimator.append(state.estimators[name], steps, moved) for name, estimator in parts.estimators.items()}
     return state._replace(human_data=data, estimators=estimators)
 
 
 def renew(
-    parts: Parts,
-    stepped: EnvState,
-    planned: Plan,
-    humans: HumanState,
-    moving: jax.Array,
-    key_reset: jax.Array,
-    key_goal: jax.Array,
+    parts: Parts, stepped: EnvState, planned: Plan, humans: HumanState, moving: jax.Array, keys: Keys
 ) -> tuple[EnvState, jax.Array]:
     """Complete hard resets, reset whose episode ended, and draw new goals; return EnvState[N] and bool[N] hard resets."""
     n, next_goal = parts.config.num_robots, parts.env.next_goal
     reset_done = planned.resetting & (humans.duration[helper_of(humans, n)] >= parts.config.hard_reset_time)
     ended = stepped.timeout if next_goal else stepped.timeout | stepped.success
-    after = where(reset_done | (moving & ended), reset_robots(parts, key_reset), stepped)
+    after = where(reset_done | (moving & ended), reset_robots(parts, keys.reset), stepped)
     if next_goal:
-        with_goal = jax.vmap(next_goal)(after, jax.random.split(key_goal, n))
+        with_goal = jax.vmap(next_goal)(after, keys.goal)
         after = where(moving & stepped.success & ~ended, with_goal, after)
     return after, reset_done
 
 
-def learn(parts: Parts, state: FleetState, key: jax.Array) -> tuple[FleetState, jax.Array]:
+def learn(parts: Parts, state: FleetState, keys: Keys) -> tuple[FleetState, jax.Array]:
     """Take the timestep's gradient steps, policy first; return also the mean imitation loss f32[]."""
     if not parts.algorithm.updates:
         return state, jnp.zeros((), jnp.float32)
     number, data = parts.config.gradient_steps, state.human_data
 
-    def gradient_step(carry: tuple[PolicyState, dict[str, Any]], key: jax.Array):
+    def gradient_step(carry: tuple[PolicyState, dict[str, Any]], keys: jax.Array):
         policy, states = carry
-        key_policy, key_estimators = jax.random.split(key)
-        policy, loss = parts.learner.update(policy, data, key_policy)
+        policy, loss = parts.learner.update(policy, data, keys[0])
         states = {
-            name: estimator.update(states[name], policy, data, key_estimators) for name, estimator in parts.estimators.items()
+            name: estimator.update(states[name], policy, data, key)
+            for (name, estimator), key in zip(parts.estimators.items(), keys[1:], strict=True)
         }
         return (policy, states), loss
 
     carry = (state.policy, state.estimators)
-    (policy, estimators), losses = jax.lax.scan(gradient_step, carry, jax.random.split(key, number))
+    steps = jax.random.split(keys.learn, (number, 1 + len(parts.estimators)))
+    (policy, estimators), losses = jax.lax.scan(gradient_step, carry, steps)
     return state._replace(policy=policy, estimators=estimators), jnp.sum(losses) / max(number, 1)
 
 
@@ -323,12 +320,16 @@ def contain(env: EnvState, sound: jax.Array) -> EnvState:
 def find_divergence(state: FleetState) -> jax.Array:
     """Return i32[], the sum of the bits of what in `metrics.LEARNT` is not finite; what buffers hold is left out."""
     others = [learnt for name, learnt in state.estimators.items() if name not in ("safety", "goal")]
-    parts = (state.policy.params, state.estimators.get("safety"), state.estimators.get("goal"), state.priority, others)
-    flags = [~_all_finite(part) for part in parts]
+    safety, goal = (_networks(state.estimators.get(name)) for name in ("safety", "goal"))
+    flags = [~_all_finite(part) for part in (state.policy.params, safety, goal, state.priority, others)]
     return sum((flag.astype(jnp.int32) << bit for bit, flag in enumerate(flags)), jnp.int32(0))
+
+
+def _networks(critic: CriticState | None) -> Any:
+    return (critic.params, critic.target) if critic else ()
 
 
 def _all_finite(learnt: Any) -> jax.Array:
     leaves = jax.tree.leaves(learnt, is_leaf=lambda x: isinstance(x, buffer.Buffer))
     numbers = [x for x in leaves if not isinstance(x, buffer.Buffer) and jnp.issubdtype(x.dtype, jnp.floating)]
-    return jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in numbers], bool))
+    return sum((jnp.sum(x - x) for x in numbers), jnp.float32(0)) == 0  # inf - inf is NaN; it compiles to little

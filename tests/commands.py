@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from fleetjax import cli
-from fleetjax.io import folder
+from fleetjax import checks, cli, envs
+from fleetjax.config import Config
+from fleetjax.fleet import FleetState
+from fleetjax.io import folder, metrics_csv
 from fleetjax.metrics import Metrics
 
 STEPS = 120  # chunks of two
@@ -21,7 +23,7 @@ TINY = [
 
 
 def contents(path: Path) -> dict[str, bytes]:
-    """Return the files of a folder by name; those of its folders are left out."""
+    """Return the files of a folder by name; not those of its folders."""
     return {file.name: file.read_bytes() for file in path.iterdir() if file.is_file()}
 
 
@@ -46,4 +48,9 @@ def make_metrics(seed: int = 0, steps: int = 40) -> Metrics:
     """Return Metrics[T] of random numbers, as numpy arrays."""
     rng = np.random.default_rng(seed)
     counts = {name: rng.integers(0, 5, steps).astype(np.int32) for name in Metrics._fields}
-    return Metrics(**counts | {name: rng.normal(size=steps).astype(np.float32) for name in folder.REALS})
+    return Metrics(**counts | {name: rng.normal(size=steps).astype(np.float32) for name in metrics_csv.REALS})
+
+
+def shapes_of(config: Config) -> FleetState:
+    """Return shapes and types of the state of a registered environment's fleet."""
+    return checks.state_shapes(config, envs.make(config.environment, config.backend))

@@ -1,4 +1,4 @@
-"""How tests compile what is large: XLA's optimisations make a program of MJX three times slower to compile, and no righter."""
+"""How tests compile what is large, whatever else runs: XLA's optimisations take three times as long, and make it no righter."""
 
 import functools
 

@@ -55,11 +55,7 @@ def compile_once(config: fleetjax.Config, env: envs.Env, num_pictures: Sequence[
             for (structure, name, _), programs in _compiled.items():
                 if (structure, name) == key[:2]:
                     return programs
-        jax.config.update("jax_disable_most_optimizations", True)
-        try:
-            _compiled[key] = _compile(config, env, num_pictures)
-        finally:
-            jax.config.update("jax_disable_most_optimizations", False)
+        _compiled[key] = _compile(config, env, num_pictures)
     return _compiled[key]
 
 

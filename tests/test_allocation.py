@@ -8,18 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy_envs
+from compiling import compiled
 from hypothesis import given
 from hypothesis import strategies as st
 from reference import oracle, recording
-from reference.recording import quick_jit
 
 import fleetjax
+from fleetjax import allocation
 from fleetjax.allocation import allocate, helper_of
 from fleetjax.types import HumanState
 
 SHAPES = [(7, 3), (5, 5), (4, 1)]  # robots, humans
 MIN_TELEOP_TIME, HARD_RESET_TIME = 4, 2
-quick_allocate = quick_jit(allocate)
+quick_allocate = compiled(allocate)
 
 
 class Scene(NamedTuple):
@@ -130,7 +131,7 @@ def test_allocation_is_algorithm_1(scene):
         if i >= 0:
             fleet.alpha[i, j], fleet.duration[i] = 1, scene.duration[j]
             fleet.type[i] = oracle.HARD_RESET if scene.resetting[i] else oracle.TELEOP
-    tie_order = np.asarray(jax.random.permutation(jax.random.key(scene.seed), n))
+    tie_order = np.asarray(allocation.tie_order(jax.random.key(scene.seed), n))
     alpha = oracle.allocate(problem, fleet, list(scene.score), tie_order, scene.available)
     np.testing.assert_array_equal(recording.matrix(solve(scene).robot, n), alpha)
 
@@ -157,10 +158,10 @@ def solve_in_order(scene: Scene, tie_order: np.ndarray) -> HumanState:
     return jax.tree.map(np.asarray, quick_allocate_in_order(scene.score, humans, scene.min_time, tie_order, scene.available))
 
 
-@quick_jit
+@compiled
 def quick_allocate_in_order(score, humans, min_time, tie_order, available) -> HumanState:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jax.random, "permutation", lambda key, n: tie_order)
+        patch.setattr(allocation, "tie_order", lambda key, n: tie_order)
         return allocate(score, humans, min_time, jax.random.key(0), available)
 
 
@@ -170,7 +171,7 @@ def test_ties_are_broken_fairly(num_humans):
     humans = HumanState(jnp.full(num_humans, -1), jnp.zeros(num_humans, jnp.int32))
     score = jnp.array([1.0, 1.0, 1.0, 1.0, 1.0, 0.5])
     keys = jax.random.split(jax.random.key(7), num_draws)
-    robot = quick_jit(jax.vmap(lambda key: allocate(score, humans, jnp.full(6, 5), key).robot))(keys)
+    robot = compiled(jax.vmap(lambda key: allocate(score, humans, jnp.full(6, 5), key).robot))(keys)
     counts = np.bincount(np.asarray(robot).ravel(), minlength=6)
     assert counts[5] == 0
     expected = num_draws * num_humans / num_robots
@@ -207,7 +208,7 @@ def loop(algorithm: str, num_robots: int, num_humans: int):
         key = jax.random.key(seed)
         return recording.record(config, env, fleetjax.make_fleet(config, env), recording.start(config, env, key), key)
 
-    jitted = quick_jit(run)
+    jitted = compiled(run)
     return lambda *args: jax.tree.map(np.asarray, jitted(*args))
 
 

@@ -32,14 +32,19 @@ def test_a_store_keeps_the_first_rows_in_order(steps):
     np.testing.assert_array_equal(store.rows["x"], kept + [0] * (CAPACITY - len(kept)))
 
 
-@pytest.mark.parametrize("counted", [buffer.COUNTED, 20])
-@given(masks)
-def test_a_ring_keeps_the_last_rows(counted, steps):
-    with pytest.MonkeyPatch.context() as patch:  # a small limit stands for the 2^30 rows that no test can add
-        patch.setattr(buffer, "COUNTED", counted)
+@pytest.fixture(scope="module", params=[buffer.COUNTED, 20])
+def counted(request):
+    """The usual limit, and a small one, which stands for the 2^30 rows that no test can add."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(buffer, "COUNTED", request.param)
         append.clear_cache()
-        store, given = fill(steps, overwrite=True)
+        yield request.param
     append.clear_cache()
+
+
+@given(steps=masks)
+def test_a_ring_keeps_the_last_rows(counted, steps):
+    store, given = fill(steps, overwrite=True)
     assert int(store.size) == min(len(given), CAPACITY)
     assert int(store.added) < counted
     ring = np.zeros(CAPACITY, int)

@@ -16,7 +16,7 @@ from commands import STEPS, TINY, contents, refused
 
 import fleetjax
 from fleetjax import cli
-from fleetjax.io import figure, folder, render
+from fleetjax.io import chunks, export, figure, files, folder, metrics_csv, render, resumable
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def test_chunks_give_the_run_that_the_library_gives(finished):
     assert np.sum(whole.metrics.hard_resets) > 0
     assert np.sum(whole.metrics.teleop_steps) > 0
     for name, chunked, expected in zip(fleetjax.Metrics._fields, folder.read_metrics(run), whole.metrics, strict=True):
-        if name in folder.REALS:
+        if name in metrics_csv.REALS:
             np.testing.assert_allclose(chunked, expected, rtol=1e-4, atol=1e-5, err_msg=name)
         else:
             np.testing.assert_array_equal(chunked, expected, err_msg=name)
@@ -83,7 +83,7 @@ def test_default_folders_are_made_below_runs_and_never_used_again(finished, tmp_
     assert cli.main(["plot", *(f"runs/{name}" for name in names), "--output", "all.svg"]) == 0
     printed = capsys.readouterr()
     assert printed.out == "all.svg\n"
-    assert printed.err == "1 run left out: same settings and seed as a later one\n"
+    assert printed.err == "skipped 1 run with the same settings and seed as a later one\n"
     assert "mean of 2 seeds" in Path("all.svg").read_text()
 
 
@@ -124,7 +124,7 @@ def test_evaluation_is_the_librarys(copied, capsys):
 
 def test_an_evaluation_is_shown_even_if_it_cannot_be_stored(copied, monkeypatch, capsys):
     full = OSError(28, "No space left on device", "evaluation.json")
-    monkeypatch.setattr(cli.files, "write_json", lambda *arguments: (_ for _ in ()).throw(full))
+    monkeypatch.setattr(files, "write_json", lambda *arguments: (_ for _ in ()).throw(full))
     assert cli.main(["evaluate", str(copied), "--num-steps", "16"]) == 2
     printed = capsys.readouterr()
     assert printed.out.splitlines()[-1].startswith("C.U.R. ")
@@ -150,9 +150,9 @@ def fail(*arguments, **options):
 def test_outputs_that_cannot_be_written_are_refused_before_anything_is_computed(copied, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(render, "start", fail)
     monkeypatch.setattr(figure, "draw", fail)
-    monkeypatch.setattr(cli.execution, "start_evaluation", fail)
+    monkeypatch.setattr(chunks, "start_evaluation", fail)
     monkeypatch.setattr(folder, "read_interventions", lambda run: [])
-    monkeypatch.setattr(cli.export, "export", fail)
+    monkeypatch.setattr(export, "export", fail)
     file = tmp_path / "file"
     file.touch()
     commands = {"png": ("plot", copied), "gif": ("render", "navigation"), "hdf5": ("export", copied, "--format", "robomimic")}
@@ -170,7 +170,7 @@ def test_outputs_that_cannot_be_written_are_refused_before_anything_is_computed(
     assert f"{file} is a file" in refused(capsys, "export", copied, "--format", "minari", "--output", file, "--overwrite")
     before = contents(copied)
     read_only = OSError(30, "Read-only file system")
-    monkeypatch.setattr(cli.files.tempfile, "NamedTemporaryFile", lambda **options: (_ for _ in ()).throw(read_only))
+    monkeypatch.setattr(files.tempfile, "NamedTemporaryFile", lambda **options: (_ for _ in ()).throw(read_only))
     said = refused(capsys, "evaluate", copied)
     assert f"{copied / 'evaluation.json'} cannot be written: Read-only file system" in said
     assert contents(copied) == before
@@ -269,7 +269,7 @@ def test_parameters_arrive_as_they_are_typed(monkeypatch, tmp_path):
         made.append((run.config, run.seed))
         raise OSError("stop here")
 
-    monkeypatch.setattr(cli.operation, "operate", operate)
+    monkeypatch.setattr(resumable, "run_in_folder", operate)
     flags = ["--hidden-sizes", "16", "8", "--no-normalize-observations", "--num-steps", "1e3", "--risk-threshold", ".25"]
     fleet = ["--algorithm", "expert", "--num-robots", "7", "--backend", "native"]
     assert cli.main(["run", "navigation", *fleet, "--seed", "4294967295", *flags]) == 2

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import compiled
 from reference import recording
-from reference.recording import quick_jit
 
 import fleetjax
 from fleetjax import envs, metrics, tree
@@ -67,12 +67,11 @@ def test_one_robots_numbers_do_not_reach_its_neighbours(name):
     env, fleet, first = fleet_of(config)
 
     def step(state, key, spoilt_action):
-        key_plan, key_advance = jax.random.split(key)
-        state, plan = fleet.plan(state, key_plan)
-        action = 0.1 * jax.random.normal(key_advance, (N, env.spec.action_size))
-        return fleet.advance(state, plan, action.at[BAD, 0].add(spoilt_action), plan.teleoperated, key_advance)
+        state, plan = fleet.plan(state, key)
+        action = 0.1 * jax.random.normal(key, (N, env.spec.action_size))
+        return fleet.advance(state, plan, action.at[BAD, 0].add(spoilt_action), plan.teleoperated, key)
 
-    step = quick_jit(step)
+    step = compiled(step)
     expected, _ = step(first, jax.random.key(1), 0.0)
     for value in SPOILT:
         for spoil, action in ((spoil_obs, 0.0), (spoil_physics, 0.0), (spoil_nothing, value)):
@@ -98,7 +97,7 @@ def learning(request):
     def run(state):
         return jax.lax.scan(lambda s, t: fleet.step(s, jax.random.fold_in(jax.random.key(5), t)), state, jnp.arange(40))
 
-    return quick_jit(run), first
+    return compiled(run), first
 
 
 @pytest.mark.parametrize("spoil", [spoil_obs, spoil_physics])
@@ -146,7 +145,7 @@ def test_what_diverged_and_when_first_is_told(algorithm, spoil, named):
     config = make_config("navigation", algorithm)
     _, fleet, first = fleet_of(config)
 
-    @quick_jit
+    @compiled
     def run(state):
         def step(state, t):
             state = jax.lax.cond(t == 7, spoil, lambda s: s, state)
@@ -162,7 +161,7 @@ def test_what_diverged_and_when_first_is_told(algorithm, spoil, named):
 def test_learning_that_diverges_is_told():
     """Steps as long as f32 goes blow up the policy, really, in the first timesteps with data."""
     config = make_config("navigation", "cur", gradient_steps=1, learning_rate=3e38, num_demonstrations=20, pretraining_steps=1)
-    counts = quick_jit(fleetjax.run)(config, jax.random.key(0)).metrics
+    counts = compiled(fleetjax.run)(config, jax.random.key(0)).metrics
     first, names = metrics.first_divergence(counts) or (None, ())
     assert first is not None
     assert set(names) & {"policy", "safety critic"}

@@ -69,7 +69,7 @@ def full(safe_config, run):
 
 def test_a_full_state_is_refused_and_extended_it_keeps_all(safe, safe_config, run, full):
     with pytest.raises(
-        ValueError, match=r"num_steps = 30 can give 60 human pairs.*room for 0 more.*fleetjax\.extend\(state, 60\)"
+        ValueError, match=r"num_steps = 30 can produce 60 human pairs.*room for 0 more.*fleetjax\.extend\(state, 60\)"
     ):
         fleetjax.run(safe_config, KEY, full.state, safe)
     extended = fleetjax.extend(full.state, 60)
@@ -144,12 +144,12 @@ def test_extend_takes_several_fleets_and_refuses_nonsense(config):
 @pytest.mark.parametrize(
     ("environment", "algorithm", "change", "message"),
     [
-        ("navigation", "uc", {"num_humans": 3}, "num_humans = 3, and the state was prepared for 2"),
-        ("navigation", "uc", {"num_robots": 5}, "num_robots = 5, and the state was prepared for 4"),
-        ("block_push", "uc", {}, "environment = 'block_push', and the state was prepared for 'navigation'"),
+        ("navigation", "uc", {"num_humans": 3}, "num_humans = 3, but the state was prepared for 2"),
+        ("navigation", "uc", {"num_robots": 5}, "num_robots = 5, but the state was prepared for 4"),
+        ("block_push", "uc", {}, "environment = 'block_push', but the state was prepared for 'navigation'"),
         ("navigation", "cur", {}, "algorithm = 'cur' keeps other estimators or another memory than 'uc'"),
         ("navigation", "thrifty_dagger", {}, "algorithm = 'thrifty_dagger' keeps other estimators or another memory than 'uc'"),
-        ("navigation", "uc", {"hidden_sizes": (5,)}, r"its \.policy\.params.*float32\[2, 4\], and float32\[2, 5\] is wanted"),
+        ("navigation", "uc", {"hidden_sizes": (5,)}, r"its \.policy\.params.*float32\[2, 4\]; expected float32\[2, 5\]"),
     ],
 )
 def test_a_state_that_does_not_fit_is_refused_with_both_sides_named(config, environment, algorithm, change, message):

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy_envs
-from reference.recording import quick_jit
+from compiling import compiled
 
 import fleetjax
 from fleetjax.envs import begin
@@ -43,7 +43,7 @@ def outcome(toy_supervisors):
         critic_pretraining_steps=20,
         critic_capacity=1000,
     )
-    run = quick_jit(lambda key: fleetjax.run(config, key, env=env))
+    run = compiled(lambda key: fleetjax.run(config, key, env=env))
     return env, config, run(jax.random.key(0))
 
 

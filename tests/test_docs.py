@@ -94,7 +94,7 @@ def test_custom_page_runs(capsys):
 
 
 @pytest.mark.usefixtures("own_registries", "quick_compilation", "small_fleets")
-@pytest.mark.parametrize("name", [name for name in PAGES if name != "docs/custom.md"])
+@pytest.mark.parametrize("name", [pytest.param(p, marks=pytest.mark.slow) for p in PAGES if p != "docs/custom.md"])
 def test_other_pages_run(name):
     assert run_page(name)
 

@@ -11,7 +11,7 @@ from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks
 from trainings import TRAININGS
 
-from fleetjax import envs, supervisors
+from fleetjax import envs, expert_records, supervisors
 from fleetjax.envs import allegro_hand, anymal
 from fleetjax.supervisors import expert
 
@@ -114,7 +114,7 @@ def test_networks_see_the_view_and_a_stage_sets_the_tolerance():
 @pytest.mark.parametrize("name", [path.stem for path in Path(expert.__file__).parent.glob("weights/*.npz")])
 def test_every_shipped_expert_has_its_record(name):
     env = envs.make(name)
-    record = expert.record(name)
+    record = expert_records.record(name)
     assert record["environment"] == name
     assert 0 < record["share_full_length"] <= 1
     assert record["mean_return_full_length"] >= record["mean_return"]

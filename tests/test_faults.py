@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 import toy_envs
+from compiling import compiled
 from reference import recording
-from reference.recording import quick_jit
 
 import fleetjax
 from fleetjax import allocation, fleet
@@ -65,7 +65,7 @@ def clock_goes_on_when_the_type_changes(patch, config, env):
 
 @fault("c", "allocation")
 def ties_broken_by_index(patch, config, env):
-    patch.setattr(allocation.jax.random, "permutation", lambda key, n: jnp.arange(n))
+    patch.setattr(allocation, "tie_order", lambda key, n: jnp.arange(n))
     return make_fleet(config, env)
 
 
@@ -212,7 +212,7 @@ def start(algorithm: str) -> tuple[fleetjax.Config, fleetjax.FleetState]:
         min_teleop_time=4,
         hard_reset_time=3,
         initial_period=12,
-        uncertainty_threshold=0.85,
+        uncertainty_threshold=0.1,  # about half of what these networks report lies above
         hidden_sizes=(2,),
         ensemble_size=2,
         gradient_steps=0,
@@ -220,7 +220,7 @@ def start(algorithm: str) -> tuple[fleetjax.Config, fleetjax.FleetState]:
         num_demonstrations=4,
         critic_capacity=1000,
     )
-    return config, quick_jit(lambda key: recording.start(config, ENV, key))(jax.random.key(0))
+    return config, compiled(lambda key: recording.start(config, ENV, key))(jax.random.key(4))
 
 
 def run_against_the_oracle(algorithm: str, make: Callable[[fleetjax.Config, Env], Fleet]) -> recording.Trace:
@@ -228,9 +228,9 @@ def run_against_the_oracle(algorithm: str, make: Callable[[fleetjax.Config, Env]
     config, first = start(algorithm)
 
     def run(config, first, key):
-        return recording.record(config, ENV, make(config, ENV), first, key, absence=0.05, silence=0.05)
+        return recording.record(config, ENV, make(config, ENV), first, key, absence=0.05, silence=0.2)
 
-    trace = quick_jit(run)(config, first, jax.random.key(0))
+    trace = compiled(run)(config, first, jax.random.key(0))
     recording.compare(config, ENV, trace)
     return trace
 

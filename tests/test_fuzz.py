@@ -14,14 +14,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from commands import TINY, edit_config
+from commands import TINY, edit_config, shapes_of
+from compiling import compiled
 from hypothesis import strategies as st
-from reference.recording import quick_jit
 
 import fleetjax
 from fleetjax import cli
 from fleetjax.config import FIELDS, Config, all_fields, needed_human_capacity
-from fleetjax.io import checkpoint, files, folder, interventions, operation
+from fleetjax.io import checkpoint, files, folder, interventions, plain
 
 OF_A_RUN = [name for name in folder.DATA if name != folder.RECORD]  # which consoles alone have
 FEW = hypothesis.settings(max_examples=200, deadline=None, suppress_health_check=list(hypothesis.HealthCheck))
@@ -90,7 +90,7 @@ def test_a_configuration_is_valid_or_its_error_names_a_field(environment, fields
             assert field.high is None or value <= field.high
     assert config.num_humans <= config.num_robots
     assert config.human_capacity >= needed_human_capacity(config)
-    assert json.loads(json.dumps(folder.to_plain(config))) == folder.to_plain(config)
+    assert json.loads(json.dumps(plain.to_plain(config))) == plain.to_plain(config)
 
 
 # Settings, through the whole loop
@@ -146,7 +146,7 @@ def program():
         kept = (result.state.humans, result.state.env, result.state.human_data.pairs.added, result.state.resetting)
         return result.metrics, kept
 
-    return quick_jit(run)
+    return compiled(run)
 
 
 @pytest.mark.parametrize(("algorithm", "shape"), SHAPES, ids=[algorithm for algorithm, _ in SHAPES])
@@ -230,8 +230,8 @@ def test_any_value_in_a_configuration_is_read_as_it_is_or_refused(finished, tmp_
         assert "config.json" in refusal
         return
     assert name != "flux"
-    read = folder.to_plain(run.config)[name]
-    if name == "human_capacity" and value == 0:  # all that a run can give
+    read = plain.to_plain(run.config)[name]
+    if name == "human_capacity" and value == 0:  # as many as a run can produce
         value = needed_human_capacity(run.config)
     assert read == value or math.isclose(read, value, rel_tol=1e-6, abs_tol=1e-37)
 
@@ -280,7 +280,7 @@ def test_nothing_that_is_read_is_executed(finished, tmp_path):
         folder.write_config(run._replace(folder=path), sealed=True)  # so that its digest is right
         with pytest.raises(ValueError, match=name):
             read_all(path)
-    shapes = operation.execution.shapes(run.config, jax.random.key(0))
+    shapes = shapes_of(run.config)
     for file in sorted((finished / checkpoint.FOLDER).rglob("*")):
         if file.is_dir() or file.name == "commit_success.txt":
             continue

@@ -251,9 +251,9 @@ def test_episode_ends_after_999_steps(env, step, steps, total, timeout, success)
 
 def test_bar_for_success():
     """Unless told, 6000 or 95 % of the expert's return, the larger."""
-    from fleetjax.supervisors import expert
+    from fleetjax import expert_records
 
-    bar = max(6000.0, 0.95 * expert.mean_return("humanoid"))
+    bar = max(6000.0, 0.95 * expert_records.mean_return("humanoid"))
     env = humanoid.make_env(backend="native")
     start = env.reset(jax.random.key(0), jnp.int32(0))
     for total, success in ((bar - 10, False), (bar + 10, True)):

@@ -15,7 +15,7 @@ from commands import edit_config, make_metrics
 from hypothesis import strategies
 
 import fleetjax
-from fleetjax.io import checkpoint, execution, files, folder
+from fleetjax.io import checkpoint, chunks, files, folder, metrics_csv, plain
 from fleetjax.learning.imitation import make_learner
 from fleetjax.learning.networks import Normalizer
 from fleetjax.metrics import Metrics
@@ -46,8 +46,8 @@ def saved(tmp_path, config):
     run = folder.Run(path, config, 5)
     folder.create(run)
     folder.write_policy(path, make_policy())
-    with contextlib.closing(folder.open_metrics(path)) as log:
-        folder.append_metrics(log, make_metrics(), 0)
+    with contextlib.closing(metrics_csv.open_log(path)) as log:
+        metrics_csv.append(log, make_metrics(), 0)
     folder.write_config(run, sealed=True)
     return path
 
@@ -55,7 +55,7 @@ def saved(tmp_path, config):
 def test_a_run_folder_comes_back_as_it_was(saved, config):
     run = folder.read_run(saved)
     assert run.seed == 5
-    assert folder.to_plain(run.config) == folder.to_plain(config)
+    assert plain.to_plain(run.config) == plain.to_plain(config)
     jax.tree.map(np.testing.assert_array_equal, run.config, config)
     for read, written in zip(folder.read_metrics(run), make_metrics(), strict=True):
         assert read.dtype == written.dtype
@@ -109,7 +109,7 @@ def edit(path: Path, old: str, new: str) -> None:
 
 
 DAMAGES = {
-    "no folder": (lambda run: [path.unlink() for path in run.iterdir()] and run.rmdir(), "there is none"),
+    "no folder": (lambda run: [path.unlink() for path in run.iterdir()] and run.rmdir(), "it does not exist"),
     "no config": (lambda run: (run / "config.json").unlink(), "config.json is missing"),
     "no metrics": (lambda run: (run / "metrics.csv").unlink(), "metrics.csv is missing"),
     "no policy": (lambda run: (run / "policy.msgpack").unlink(), "policy.msgpack is missing"),
@@ -119,10 +119,10 @@ DAMAGES = {
     "no JSON": (lambda run: (run / "config.json").write_text("{"), "config.json cannot be used"),
     "no text": (lambda run: (run / "config.json").write_bytes(b"\xff\xfe\x00"), "config.json cannot be used"),
     "deep JSON": (lambda run: (run / "config.json").write_text("[" * 200_000), "nested too deeply"),
-    "a list": (lambda run: (run / "config.json").write_text("[1]"), "not fleetjax's"),
-    "a foreign file": (lambda run: (run / "config.json").write_text('{"config": {"lr": 1}}'), "no SHA-256 of its own"),
+    "a list": (lambda run: (run / "config.json").write_text("[1]"), "not written by fleetjax"),
+    "a foreign file": (lambda run: (run / "config.json").write_text('{"config": {"lr": 1}}'), "no SHA-256 digest of its own"),
     "sealed by others": (lambda run: edit_config(run, lambda content: content.pop("seed")), "seed = None"),
-    "other digests": (lambda run: edit_config(run, lambda content: content["sha256"].update(mine="")), "are those of others"),
+    "other digests": (lambda run: edit_config(run, lambda content: content["sha256"].update(mine="")), "or name other files"),
     "another robot": (lambda run: edit(run / "config.json", '"navigation"', '"humanoid"'), "it was edited or is damaged"),
     "another version": (lambda run: edit(run / "config.json", '"mujoco": "', '"mujoco": "1'), "it was edited or is damaged"),
     "sealed by hand": (lambda run: edit(run / "config.json", '"sha256_config": "', '"sha256_config": "0'), "it was edited"),
@@ -264,15 +264,15 @@ def test_only_a_run_is_overwritten(saved, tmp_path):
 @hypothesis.given(strategies.integers(1, 200_000), strategies.integers(2, 5_000) | strategies.none())
 def test_chunks_add_up_and_need_at_most_two_programs(num_steps, within):
     """And none is a single timestep, which would be a program with other roundings."""
-    length = execution.chunk_length(num_steps, within)
-    lengths = execution.chunks_of(num_steps, length)
+    length = chunks.chunk_length(num_steps, within)
+    lengths = chunks.chunks_of(num_steps, length)
     assert sum(lengths) == num_steps
     assert len(set(lengths)) <= 2
     assert 1 not in lengths or num_steps == 1
-    assert within or len(lengths) <= 3 * execution.CHUNKS + 1
-    assert max(lengths) <= max(3, within or num_steps, 3 * num_steps // execution.CHUNKS) + 3
+    assert within or len(lengths) <= 3 * chunks.CHUNKS + 1
+    assert max(lengths) <= max(3, within or num_steps, 3 * num_steps // chunks.CHUNKS) + 3
 
 
 def test_a_paper_scale_run_is_a_hundred_equal_chunks():
-    assert execution.chunks_of(10_000, execution.chunk_length(10_000, 1000)) == [100] * 100
-    assert execution.chunks_of(2_000, execution.chunk_length(2_000, 1000)) == [20] * 100
+    assert chunks.chunks_of(10_000, chunks.chunk_length(10_000, 1000)) == [100] * 100
+    assert chunks.chunks_of(2_000, chunks.chunk_length(2_000, 1000)) == [20] * 100

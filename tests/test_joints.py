@@ -12,7 +12,7 @@ from compiling import compiled
 
 import fleetjax
 from fleetjax import cli, priority
-from fleetjax.io import folder
+from fleetjax.io import plain
 from fleetjax.learning import estimators
 
 SMALL = {
@@ -87,7 +87,7 @@ def test_parameters_are_traced_checked_swept_and_the_algorithms_alone(capsys):
     assert config.replace(algorithm="uc").parameters == {}
     with pytest.raises(ValueError, match=r"weight = 3\.0 must be in \[0, 2\]"):
         fleetjax.make_config("navigation", "weighing", weight=3)
-    elsewhere = "weight is a parameter of algorithm = 'weighing', and not of 'uc'"
+    elsewhere = "weight is a parameter of algorithm = 'weighing', not of 'uc'"
     with pytest.raises(ValueError, match=elsewhere):
         fleetjax.make_config("navigation", "uc", weight=0.1)
     with pytest.raises(ValueError, match=elsewhere):
@@ -95,7 +95,7 @@ def test_parameters_are_traced_checked_swept_and_the_algorithms_alone(capsys):
     assert "weight is a parameter of" in refused(capsys, "run", "navigation", "--weight", "0.1")
     assert cli.main(["list"]) == 0
     assert "weighing's own parameter: weight 0.5" in capsys.readouterr().out
-    assert folder.to_plain(config)["weight"] == 0.0
+    assert plain.to_plain(config)["weight"] == 0.0
 
     program = compiled(lambda config: fleetjax.run(config, KEY).metrics.human_steps.sum())
     assert int(program(config)) == 24

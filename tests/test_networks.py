@@ -40,14 +40,15 @@ def oracle(params, x):
 
 def test_an_image_network_is_that_of_the_definition():
     network = networks.make_network(SPEC, (16,), 2)
+    apply = jax.jit(network.apply)
     x = jax.random.normal(jax.random.key(0), (5, SPEC.observation_size + 4))
     params = jax.tree.map(
-        lambda p: p + 0.3 * jax.random.normal(jax.random.key(1), p.shape), network.init(jax.random.key(2), x[0])
+        lambda p: p + 0.3 * jax.random.normal(jax.random.key(1), p.shape), jax.jit(network.init)(jax.random.key(2), x[0])
     )
-    found = jax.jit(network.apply)(params, x)
+    found = apply(params, x)
     np.testing.assert_allclose(found, [oracle(params, row) for row in x], atol=1e-4)
-    np.testing.assert_allclose(network.apply(params, x[3]), found[3], atol=1e-5)
-    changed = network.apply(params, x.at[:, -1].add(1.0))  # what follows the image counts as well
+    np.testing.assert_allclose(apply(params, x[3]), found[3], atol=1e-5)
+    changed = apply(params, x.at[:, -1].add(1.0))  # what follows the image counts as well
     assert np.abs(changed - found).min() > 1e-4
 
 

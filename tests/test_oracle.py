@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy_envs
+from compiling import compiled
 from reference import oracle, recording
-from reference.recording import quick_jit
 
 import fleetjax
 from fleetjax import envs
@@ -61,7 +61,7 @@ def toy_supervisors():
         yield
 
 
-def run_both(env, configs: list[fleetjax.Config], absences: list[float], seed: int = 0):
+def run_both(env, configs: list[fleetjax.Config], absences: list[float], seed: int = 1):
     """Return the trace of each configuration and what the oracle saw; they differ in traced fields only."""
 
     def run(config, absence, key):
@@ -71,7 +71,7 @@ def run_both(env, configs: list[fleetjax.Config], absences: list[float], seed: i
 
     keys = jax.random.split(jax.random.key(seed), len(configs))
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *configs)
-    traces = quick_jit(jax.vmap(run))(stacked, jnp.array(absences), keys)
+    traces = compiled(jax.vmap(run))(stacked, jnp.array(absences), keys)
     traces = jax.tree.map(np.asarray, traces)
     each = [jax.tree.map(lambda x, k=k: x[k], traces) for k in range(len(configs))]
     return each, [recording.compare(config, env, trace) for config, trace in zip(configs, each, strict=True)]

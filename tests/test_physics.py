@@ -17,9 +17,17 @@ from fleetjax.physics.base import PhysicsState, make_physics, resolve_backend
 
 NUM_ROBOTS = 32  # of every batch, so that MJX compiles once
 BACKENDS = ("native", "mjx")
+QUICK = "anymal"  # MJX takes long to compile a robot, and this one least of all: the others are among the slow tests
 
 each_robot = pytest.mark.parametrize("name", ROBOTS)
-each_backend = pytest.mark.parametrize("backend", BACKENDS)
+each_robot_and_backend = pytest.mark.parametrize(
+    ("name", "backend"),
+    [
+        pytest.param(name, backend, marks=[pytest.mark.slow] if backend == "mjx" and name != QUICK else [])
+        for name in ROBOTS
+        for backend in BACKENDS
+    ],
+)
 
 
 @functools.cache
@@ -175,8 +183,7 @@ def test_robots_violate_as_often_on_both_backends(name):
     assert abs(one.mean() - other.mean()) < 3 * np.sqrt((one.var() + other.var()) / NUM_ROBOTS)
 
 
-@each_robot
-@each_backend
+@each_robot_and_backend
 def test_inactive_robots_keep_their_state(name, backend):
     states, controls = mixed(name)
     states = states._replace(diverged=np.arange(NUM_ROBOTS) % 4 == 0)
@@ -186,8 +193,7 @@ def test_inactive_robots_keep_their_state(name, backend):
     assert not np.any(np.all(after.qpos[active] == states.qpos[active], axis=1))
 
 
-@each_robot
-@each_backend
+@each_robot_and_backend
 def test_neighbours_do_not_matter(name, backend):
     states, controls = mixed(name)
     move = mover(name, backend)
@@ -222,8 +228,7 @@ def infect(states: PhysicsState, controls):
     return states._replace(qpos=qpos, qvel=qvel), controls
 
 
-@each_robot
-@each_backend
+@each_robot_and_backend
 def test_a_diverged_robot_keeps_its_last_state_and_spares_the_others(name, backend, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     states, controls = mixed(name)
@@ -238,7 +243,7 @@ def test_a_diverged_robot_keeps_its_last_state_and_spares_the_others(name, backe
 
 
 @each_robot
-@each_backend
+@pytest.mark.parametrize("backend", ["native", pytest.param("mjx", marks=pytest.mark.slow)])
 def test_a_diverged_robot_is_a_violation(name, backend):
     env, step = actor(name, backend)
     before, sick = starts(env, jax.random.key(0)), SICK["control"]

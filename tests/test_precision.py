@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+import pytest
 from compiling import compiled
 
 import fleetjax
@@ -27,13 +28,14 @@ SMALL = {
 
 def run_navigation():
     """Make everything anew, as a process does that has the setting from its beginning."""
-    envs.make.cache_clear()
+    envs._make.cache_clear()
     config = fleetjax.make_config("navigation", "cur", **SMALL)
     result = compiled(fleetjax.run)(config, jax.random.key(0))
     frozen = compiled(fleetjax.evaluate)(config, jax.random.key(1), result.state.policy)
     return jax.device_get((result.metrics, frozen.metrics))
 
 
+@pytest.mark.slow
 def test_a_run_in_64_bits_is_that_in_32():
     narrow = run_navigation()
     with jax.enable_x64(True):

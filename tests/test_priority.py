@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import compiled
 from hypothesis import given
 from hypothesis import strategies as st
 from reference import oracle
-from reference.recording import quick_jit
 
 import fleetjax
 from fleetjax import priority
@@ -32,7 +32,7 @@ all_signals = st.tuples(flags, columns, columns, columns, timesteps).map(lambda 
 def scorer(name: str):
     """Return a compiled `(Signals, aux) -> (score, aux)`."""
     rule = priority.get_algorithm(name).make_priority(CONFIG.replace(algorithm=name))
-    return quick_jit(lambda signals, aux: rule.score(signals, aux, jax.random.key(0)))
+    return compiled(lambda signals, aux: rule.score(signals, aux, jax.random.key(0)))
 
 
 def score(name: str, signals: Signals) -> np.ndarray:
@@ -76,7 +76,7 @@ def test_lexicographic_scores_are_dense_ranks_of_the_tuples(table):
     assert set(ranks) | {0.0} == set(range(int(ranks.max()) + 1))
 
 
-quick_lexicographic = quick_jit(priority.lexicographic)
+quick_lexicographic = compiled(priority.lexicographic)
 
 
 @pytest.mark.parametrize("name", ["cur", "ur", "ensemble_dagger", "constraint"])

@@ -1,4 +1,4 @@
-"""A run that is stopped, killed or damaged and gone on with gives the bits of one that was not."""
+"""A run that is stopped, killed or damaged and then resumed gives the bits of one that was not."""
 
 import contextlib
 import json
@@ -16,11 +16,11 @@ import h5py
 import jax
 import numpy as np
 import pytest
-from commands import STEPS, TINY, contents, edit_config, refused
+from commands import STEPS, TINY, contents, edit_config, refused, shapes_of
 
 import fleetjax
 from fleetjax import cli
-from fleetjax.io import checkpoint, files, folder, operation
+from fleetjax.io import checkpoint, chunks, files, folder, resumable
 
 RUN = ("run", "navigation", *TINY, "--seed", "3", "--log-interventions")
 RESULTS = ("metrics.csv", "policy.msgpack", "interventions.bin")
@@ -65,11 +65,11 @@ def stopped(tmp_path, monkeypatch, whole, capsys):
     """A run with checkpoints at t = 30, 60 and 66, where Ctrl-C stopped it; the last two are kept."""
     path = tmp_path / "stopped"
     with monkeypatch.context() as patch:
-        patch.setattr(operation, "progress", interrupt_after(33))
+        patch.setattr(resumable, "progress", interrupt_after(33))
         assert run_here(*RUN, "--output", path, "--checkpoint-every", 30) == 130
     assert steps_of(path) == [60, 66]
     line = capsys.readouterr().err.splitlines()[-1]
-    assert line == f"fleetjax: interrupted at t = 66 of {STEPS}; go on with: fleetjax run --resume {path}"
+    assert line == f"fleetjax: interrupted at t = 66 of {STEPS}; resume with: fleetjax run --resume {path}"
     return path
 
 
@@ -78,6 +78,7 @@ def steps_of(path: Path) -> list[int]:
     return sorted(int(found.parent.name) for found in (path / checkpoint.FOLDER).glob(f"*/{checkpoint.MANIFEST}"))
 
 
+@pytest.mark.slow
 def test_an_undisturbed_run_is_the_librarys_bit_for_bit(whole):
     run = folder.read_run(whole)
     expected = jax.jit(fleetjax.run)(run.config, jax.random.key(3))
@@ -119,20 +120,20 @@ def test_ctrl_c_writes_a_checkpoint_from_which_the_run_goes_on(stopped, whole, c
     assert (stopped / "metrics.csv").read_text().splitlines() == (whole / "metrics.csv").read_text().splitlines()[:67]
     assert "policy.msgpack is missing" in refused(capsys, "evaluate", stopped)
     assert run_here("plot", stopped, "--output", stopped / "figure.pdf") == 0
-    assert "was interrupted; the curves of its kind end at 66 timesteps" in capsys.readouterr().err
+    assert "was interrupted; curves with the same settings end at 66 timesteps" in capsys.readouterr().err
     assert run_here("run", "--resume", stopped) == 0
-    assert f"going on from {stopped / 'checkpoints' / '0000000066'}" in capsys.readouterr().err
+    assert f"resuming from {stopped / 'checkpoints' / '0000000066'}" in capsys.readouterr().err
     assert_same(stopped, whole)
     before = contents(stopped)
     assert run_here("run", "--resume", stopped) == 0
-    assert "is finished; there is nothing to go on with" in capsys.readouterr().err
+    assert "is already finished; there is nothing to resume" in capsys.readouterr().err
     assert contents(stopped) == before
 
 
 def test_a_second_ctrl_c_stops_at_once_and_the_run_goes_on_from_an_older_checkpoint(tmp_path, monkeypatch, whole, capsys):
     path = tmp_path / "stopped"
     with monkeypatch.context() as patch:
-        patch.setattr(operation, "progress", interrupt_after(20, times=2))
+        patch.setattr(resumable, "progress", interrupt_after(20, times=2))
         assert run_here(*RUN, "--output", path, "--checkpoint-every", 30) == 130
     assert "interrupted at once, without a checkpoint" in capsys.readouterr().err
     assert steps_of(path) == [30]
@@ -145,7 +146,7 @@ def test_a_second_ctrl_c_stops_at_once_and_the_run_goes_on_from_an_older_checkpo
 def test_any_chunk_length_and_any_stop_give_the_same_bits(tmp_path, monkeypatch, whole, every):
     path = tmp_path / "stopped"
     with monkeypatch.context() as patch:
-        patch.setattr(operation, "progress", interrupt_after(1))
+        patch.setattr(resumable, "progress", interrupt_after(1))
         assert run_here(*RUN, "--output", path, "--checkpoint-every", every) == 130
         assert run_here("run", "--resume", path, "--checkpoint-every", 5) == 130
     assert run_here("run", "navigation", "--resume", path, "--num-steps", STEPS, "--seed", 3) == 0
@@ -157,7 +158,7 @@ def test_metrics_behind_the_checkpoint_are_cut_off(stopped, whole, capsys):
     folder.write_config(folder.read_run(stopped), sealed=False)  # as a kill leaves it
     with (stopped / "metrics.csv").open("a") as file:
         file.write("66,1,2")  # a row that a kill has cut
-    assert f"the run is not finished; go on with it: fleetjax run --resume {stopped}" in refused(capsys, "plot", stopped)
+    assert f"the run is not finished; resume it with: fleetjax run --resume {stopped}" in refused(capsys, "plot", stopped)
     assert run_here("run", "--resume", stopped) == 0
     assert_same(stopped, whole)
 
@@ -192,16 +193,16 @@ def notes(path: Path) -> dict:
 DAMAGES = {
     "truncated": (truncate, "damaged"),
     "bit flipped": (flip, "damaged"),
-    "another run's": (lambda path: edit(path, seed=4), "it is another run's"),
-    "another version's": (lambda path: edit(path, config={"num_robots": 4}), "it is another run's"),
+    "another run's": (lambda path: edit(path, seed=4), "it belongs to another run"),
+    "another version's": (lambda path: edit(path, config={"num_robots": 4}), "it belongs to another run"),
     "unfinished": (lambda path: (path / checkpoint.MANIFEST).unlink(), "it was never finished"),
     "manifest cut": (lambda path: os.truncate(path / checkpoint.MANIFEST, 100), "0000000066: "),
-    "not fleetjax's": (lambda path: (path / checkpoint.MANIFEST).write_text("[]"), "is not fleetjax's"),
-    "other metrics": (lambda path: edit(path, notes={"metrics": {"size": 9, "sha256": ""}}), "metrics.csv is not as it was"),
+    "not fleetjax's": (lambda path: (path / checkpoint.MANIFEST).write_text("[]"), "was not written by fleetjax"),
+    "other metrics": (lambda path: edit(path, notes={"metrics": {"size": 9, "sha256": ""}}), "metrics.csv has changed since"),
     "a file more": (lambda path: (path / "stray").write_text("?"), "damaged"),
     "other log": (
         lambda path: edit(path, notes=notes(path) | {"interventions": {"size": 9, "sha256": ""}}),
-        "interventions.bin is",
+        "interventions.bin has changed",
     ),
     "no log": (lambda path: edit(path, notes={"metrics": notes(path)["metrics"]}), "interventions"),
     "emptied": (lambda path: shutil.rmtree(path / checkpoint.ARRAYS), "damaged"),
@@ -213,10 +214,10 @@ def test_a_checkpoint_that_cannot_be_used_is_named_and_the_older_one_taken(stopp
     damage, reason = DAMAGES[name]
     damage(newest(stopped))
     assert run_here("run", "--resume", stopped) == 0
-    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith(("left out", "going on"))]
-    assert said[0].startswith(f"left out {stopped / 'checkpoints' / '0000000066'}: ")
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith(("skipped", "resuming"))]
+    assert said[0].startswith(f"skipped checkpoint {stopped / 'checkpoints' / '0000000066'}: ")
     assert reason in said[0]
-    assert said[1] == f"going on from {stopped / 'checkpoints' / '0000000060'}"
+    assert said[1] == f"resuming from {stopped / 'checkpoints' / '0000000060'}"
     assert_same(stopped, whole)
 
 
@@ -247,14 +248,14 @@ def test_every_malformed_manifest_is_passed_over_with_the_reason(stopped):
     intact = json.loads((path / checkpoint.MANIFEST).read_text())
     shown: list[str] = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(operation, "say", shown.append)
+        patch.setattr(resumable, "say", shown.append)
         for manifest in MANIFESTS:
             data = manifest if isinstance(manifest, bytes) else json.dumps(intact | manifest).encode()
             (path / checkpoint.MANIFEST).write_bytes(data)
-            start = operation._resume(run, jax.random.key(3), 2)
+            start = resumable._resume(run)
             assert int(start.state.timestep) == 60, data[:50]
             reason, chosen = shown[-2:]
-            assert re.fullmatch(rf"left out {re.escape(str(path))}: [\w ,'.-]+", reason), reason
+            assert re.fullmatch(rf"skipped checkpoint {re.escape(str(path))}: [\w ,'.-]+", reason), reason
             assert chosen.endswith("0000000060")
 
 
@@ -273,10 +274,12 @@ def test_other_versions_are_told_and_listed(stopped, whole, monkeypatch, capsys)
     versions = folder.versions()
     with monkeypatch.context() as patch:
         patch.setattr(jax, "__version__", "0.0.1")
-        patch.setattr(operation, "progress", interrupt_after(4))
+        patch.setattr(resumable, "progress", interrupt_after(4))
         assert run_here("run", "--resume", stopped, "--checkpoint-every", 0) == 130
-        expected = f"before t = 66 this run used jax {versions['jax']}; it resumes with jax 0.0.1, so its numbers may not be "
-        assert f"\n{expected}an undisturbed run's\n" in capsys.readouterr().err
+        expected = (
+            f"before t = 66 this run used jax {versions['jax']}; it resumes with jax 0.0.1, so its numbers may differ from "
+        )
+        assert f"\n{expected}those of an uninterrupted run\n" in capsys.readouterr().err
     entries = [{"timestep": 0, **versions}, {"timestep": 66, **versions, "jax": "0.0.1"}]
     assert list(folder.read_run(stopped).versions) == entries
     assert steps_of(stopped) == [66, 74]
@@ -286,7 +289,7 @@ def test_other_versions_are_told_and_listed(stopped, whole, monkeypatch, capsys)
     assert_same(stopped, whole)
 
 
-def test_a_run_that_starts_again_begins_its_list_of_versions_anew(stopped, whole):
+def test_a_run_that_starts_again_starts_its_list_of_versions_again(stopped, whole):
     shutil.rmtree(stopped / checkpoint.FOLDER)
     run = folder.read_run(stopped)
     folder.write_config(run._replace(versions=({**run.versions[0], "jax": "0.0.1"},)), sealed=False)
@@ -295,12 +298,12 @@ def test_a_run_that_starts_again_begins_its_list_of_versions_anew(stopped, whole
     assert_same(stopped, whole)
 
 
-def test_without_a_whole_checkpoint_nothing_is_touched(stopped, capsys):
+def test_without_an_intact_checkpoint_nothing_is_touched(stopped, capsys):
     for path in (stopped / checkpoint.FOLDER).iterdir():
         flip(path)
     before = everything(stopped)
     assert run_here("run", "--resume", stopped) == 2
-    assert "has no checkpoint that could be used" in capsys.readouterr().err.splitlines()[-1]
+    assert "has no checkpoint that can be used" in capsys.readouterr().err.splitlines()[-1]
     assert everything(stopped) == before
     assert steps_of(stopped) == [60, 66]
 
@@ -308,12 +311,12 @@ def test_without_a_whole_checkpoint_nothing_is_touched(stopped, capsys):
 def test_arrays_of_other_shapes_are_refused(stopped, whole):
     """Even where all digests fit: a checkpoint that orbax could restore, of another fleet."""
     config = folder.read_run(stopped).config
-    key, identity = jax.random.key(3), folder.identity(config, 3)
-    shapes = operation.execution.shapes(config.replace(num_robots=5), key)
+    identity = folder.identity(config, 3)
+    shapes = shapes_of(config.replace(num_robots=5))
     found, refused = checkpoint.restore(stopped, identity, shapes, lambda notes: None)
     assert found is None
     assert len(refused) == 2
-    found, refused = checkpoint.restore(stopped, identity, operation.execution.shapes(config, key), lambda notes: None)
+    found, refused = checkpoint.restore(stopped, identity, shapes_of(config), lambda notes: None)
     assert found is not None
     assert not refused
     assert int(found.state.timestep) == 66
@@ -344,10 +347,10 @@ def test_random_keys_and_empty_arrays_survive(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        (["--seed", "4"], "seed = 4 is not the run's, which is 3"),
-        (["--num-robots", "5"], "num_robots = 5 is not the run's, which is 4"),
-        (["--algorithm", "cu"], "algorithm = cu is not the run's"),
-        (["--overwrite"], "leave out --output and --overwrite"),
+        (["--seed", "4"], "seed = 4, but the run has 3"),
+        (["--num-robots", "5"], "num_robots = 5, but the run has 4"),
+        (["--algorithm", "cu"], "algorithm = cu, but the run has cur"),
+        (["--overwrite"], "omit --output and --overwrite"),
         (["--checkpoint-every", "1"], "checkpoint_every = 1 must be 0 (none) or at least 2"),
         (["--checkpoint-every", "-3"], "checkpoint_every = -3 must be"),
     ],
@@ -359,7 +362,7 @@ def test_flags_that_contradict_the_run_are_refused(whole, capsys, arguments, rea
 
 
 def test_what_is_no_run_or_of_a_newer_version_is_refused(stopped, capsys, tmp_path):
-    assert "is not a run folder: there is none" in refused(capsys, "run", "--resume", tmp_path / "nowhere")
+    assert "is not a run folder: it does not exist" in refused(capsys, "run", "--resume", tmp_path / "nowhere")
     assert "ENV is missing" in refused(capsys, "run")
     edit_config(stopped, lambda content: content["config"].update(flux=1))
     assert "unknown fields: flux (another version of fleetjax?)" in refused(capsys, "run", "--resume", stopped)
@@ -377,7 +380,7 @@ def test_a_folder_in_use_is_refused(stopped, whole, capsys):
 
 def test_a_finished_run_that_lacks_a_file_is_not_called_finished(whole, tmp_path, capsys):
     path = Path(shutil.copytree(whole, tmp_path / "copy"))
-    remedy = "repeat the run with --overwrite"
+    remedy = "start it again with --overwrite"
     for name in RESULTS:
         data = (path / name).read_bytes()
         (path / name).unlink()
@@ -397,11 +400,11 @@ def test_a_finished_run_that_lacks_a_file_is_not_called_finished(whole, tmp_path
         assert f"{path / name} is missing" in refused(capsys, "run", "--resume", path)
         (path / name).write_bytes(data)
         said = refused(capsys, "run", "--resume", path)
-        assert f"{path / name} cannot be used: its SHA-256 is not in config.json" in said
+        assert f"{path / name} cannot be used: its SHA-256 digest is not in config.json" in said
         assert remedy in said
         folder.write_config(run, sealed=True)
     assert run_here("run", "--resume", path) == 0
-    assert "is finished" in capsys.readouterr().err
+    assert "is already finished" in capsys.readouterr().err
 
 
 def everything(path: Path) -> dict[str, bytes]:
@@ -420,7 +423,7 @@ def test_a_run_that_cannot_begin_overwrites_nothing(stopped):
     assert everything(stopped) == before
 
 
-@pytest.mark.parametrize("where", ["start", "go_on"])
+@pytest.mark.parametrize("where", ["start", "run_chunks"])
 @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
 def test_what_stops_a_run_before_its_first_chunk_overwrites_nothing(stopped, monkeypatch, capsys, where, error):
     before, seen = everything(stopped), []
@@ -429,28 +432,28 @@ def test_what_stops_a_run_before_its_first_chunk_overwrites_nothing(stopped, mon
         seen.append(everything(stopped))  # what a kill would leave
         raise error
 
-    monkeypatch.setattr(operation.execution, where, stop)
+    monkeypatch.setattr(chunks, where, stop)
     if error is RuntimeError:
         with pytest.raises(RuntimeError):
             run_here(*OVERWRITE, stopped)
     else:
         assert run_here(*OVERWRITE, stopped) == 130
-        assert f"interrupted before the first timestep; {stopped} is as it was" in capsys.readouterr().err
+        assert f"interrupted before the first timestep; {stopped} is unchanged" in capsys.readouterr().err
     assert seen == [before]
     assert everything(stopped) == before
 
 
 def test_an_older_run_goes_with_the_first_chunk_and_ctrl_c_in_it_still_spares_it(stopped, monkeypatch):
-    before, real = everything(stopped), operation.execution.go_on
+    before, real = everything(stopped), chunks.run_chunks
 
-    def go_on(*arguments, **options):
+    def run_chunks(*arguments, **options):
         for number, chunk in enumerate(real(*arguments, **options)):
             assert (everything(stopped) == before) == (number == 0)
             if interrupted:
                 signal.raise_signal(signal.SIGINT)
             yield chunk
 
-    monkeypatch.setattr(operation.execution, "go_on", go_on)
+    monkeypatch.setattr(chunks, "run_chunks", run_chunks)
     for interrupted, code in ((True, 130), (False, 0)):
         assert run_here(*OVERWRITE, stopped) == code
         assert (everything(stopped) == before) == interrupted
@@ -462,7 +465,7 @@ def test_an_older_run_goes_with_the_first_chunk_and_ctrl_c_in_it_still_spares_it
 def test_a_run_that_is_stopped_before_its_first_checkpoint_is_read_resumes_later(stopped, whole, monkeypatch):
     before = everything(stopped)
     with monkeypatch.context() as patch:
-        patch.setattr(operation.execution, "shapes", lambda *arguments: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(resumable, "state_shapes", lambda *arguments: (_ for _ in ()).throw(KeyboardInterrupt))
         assert run_here("run", "--resume", stopped) == 130
     assert everything(stopped) == before
     assert run_here("run", "--resume", stopped) == 0
@@ -472,7 +475,7 @@ def test_a_run_that_is_stopped_before_its_first_checkpoint_is_read_resumes_later
 def test_a_policy_that_diverges_ends_the_run_and_says_when(stopped, capsys):
     """One member's weights are spoilt in a checkpoint; the run ends behind the next chunk, with its metrics so far."""
     run = folder.read_run(stopped)
-    identity, shapes = folder.identity(run.config, 3), operation.execution.shapes(run.config, jax.random.key(3))
+    identity, shapes = folder.identity(run.config, 3), shapes_of(run.config)
     found, _ = checkpoint.restore(stopped, identity, shapes, lambda notes: None)
     assert found is not None
     learner = found.state.policy
@@ -483,7 +486,7 @@ def test_a_policy_that_diverges_ends_the_run_and_says_when(stopped, capsys):
     assert run_here("run", "--resume", stopped) == 1
     line = capsys.readouterr().err.splitlines()[-1]
     assert line.startswith("fleetjax: not finite from t = 66 on: policy")
-    assert f"Metrics so far are in {stopped}" in line
+    assert f"The metrics so far are in {stopped}" in line
     assert len(folder.read_metrics(folder.read_run(stopped)).successes) == 68
     assert steps_of(stopped) == [60, 66]
 
@@ -530,12 +533,12 @@ def test_kills_at_random_moments_lose_no_bit(tmp_path, whole, spawn):
                 time.sleep(rng.uniform(0, 0.02))
                 process.kill()
             _, said = process.communicate()
-        resumed += "going on from" in said
+        resumed += "resuming from" in said
         arguments = ("run", "--resume", path, "--checkpoint-every", 10)
     process = spawn(*arguments)
     _, said = process.communicate()
     assert process.returncode == 0, said
-    assert resumed + ("going on from" in said) == 2
+    assert resumed + ("resuming from" in said) == 2
     assert_same(path, whole)
 
 
@@ -557,7 +560,7 @@ def test_a_kill_during_a_checkpoint_leaves_the_older_ones(stopped, whole, spawn,
     assert run_here("run", "--resume", stopped) == 0
     said = capsys.readouterr().err
     assert "it was never finished" in said
-    assert "going on from" in said
+    assert "resuming from" in said
     assert_same(stopped, whole)
 
 
@@ -565,7 +568,7 @@ def test_a_full_disk_during_a_checkpoint_is_told_and_the_older_ones_stay(tmp_pat
     """Files may grow to a size that the logs need until t = 44, and that is too small for a checkpoint."""
     path, size = tmp_path / "stopped", (whole / "interventions.bin").stat().st_size * 44 // STEPS
     with monkeypatch.context() as patch:
-        patch.setattr(operation, "progress", interrupt_after(15))
+        patch.setattr(resumable, "progress", interrupt_after(15))
         assert run_here(*RUN, "--output", path, "--checkpoint-every", 20) == 130
     assert steps_of(path) == [20, 30]
     assert largest(newest(path)).stat().st_size > size > (whole / "metrics.csv").stat().st_size

@@ -13,7 +13,7 @@ import pytest
 from commands import TINY, make_metrics
 
 import fleetjax
-from fleetjax.io import folder
+from fleetjax.io import folder, metrics_csv
 
 ROOT = Path(__file__).parents[1]
 SCRIPTS = sorted(
@@ -55,8 +55,8 @@ def make_runs(place: Path) -> None:
     for seed in range(2):
         path = place / f"run-{seed}"
         path.mkdir()
-        log = folder.open_metrics(path)
-        folder.append_metrics(log, make_metrics(seed, 40), 0)
+        log = metrics_csv.open_log(path)
+        metrics_csv.append(log, make_metrics(seed, 40), 0)
         log.close()
         folder.write_config(folder.Run(path, config, seed), sealed=True)
 

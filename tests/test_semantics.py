@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy_envs
+from compiling import compiled
 from reference import recording
-from reference.recording import quick_jit
 from reference.scenario import HORIZON, NOBODY, TINY, M, N, T, make_counting_learner, play, program
 from toy_envs import ALWAYS, NEVER
 
@@ -16,7 +16,7 @@ from fleetjax.envs import base
 from fleetjax.learning import imitation
 from fleetjax.types import HumanState
 
-quick_allocate = quick_jit(allocate)
+quick_allocate = compiled(allocate)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -120,7 +120,7 @@ def test_semantic_05_humans_left_over_are_free():
 def test_semantic_05_with_one_human_no_robot_is_starved_by_its_index():
     human = HumanState(jnp.array([-1]), jnp.array([0]))
     keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(0), jnp.arange(60))
-    first = quick_jit(jax.vmap(lambda key: allocate(jnp.ones(5), human, jnp.full(5, 5), key).robot[0]))(keys)
+    first = compiled(jax.vmap(lambda key: allocate(jnp.ones(5), human, jnp.full(5, 5), key).robot[0]))(keys)
     assert set(first.tolist()) == {0, 1, 2, 3, 4}
 
 
@@ -134,7 +134,7 @@ def test_semantic_06_no_help_at_priority_zero_in_the_initial_period_but_locks_fi
         start = recording.start(config, env, jax.random.key(0))
         return recording.record(config, env, fleetjax.make_fleet(config, env), start, jax.random.key(0))
 
-    trace = quick_jit(run)(config)
+    trace = compiled(run)(config)
     # Two robots are teleoperated from t = 0. At t = 3 all have fallen and score 0, yet both locks go on as hard resets. The
     # other two robots wait until t = 8, when all have fallen again.
     assert trace.plan.score[3].tolist() == NOBODY
@@ -157,7 +157,7 @@ def test_semantic_07_a_violating_robot_chosen_for_uncertainty_or_risk_is_reset()
         state = state._replace(env=state.env._replace(violation=fallen))
         return fleetjax.make_fleet(config, env).plan(state, key)[1]
 
-    planned = quick_jit(plan)(jax.random.key(0))
+    planned = compiled(plan)(jax.random.key(0))
     # The untrained members differ most where the observation is largest: at robots 2 and 3.
     assert np.argsort(planned.signals.uncertainty).tolist() == [0, 1, 2, 3]
     assert np.all((np.asarray(planned.signals.risk) > 0) & (np.asarray(planned.signals.risk) < 1))
@@ -187,9 +187,9 @@ def test_semantic_08_a_robot_drawn_into_a_violation_needs_another_whole_reset():
 
 def test_semantic_08_times_are_traced():
     play([NOBODY], t_R=1)
-    compiled = program()._cache_size()
+    programs = program()._cache_size()
     play([NOBODY], t_R=7, t_T=3)
-    assert program()._cache_size() == compiled
+    assert program()._cache_size() == programs
 
 
 def test_semantic_08_no_policy_acts_on_a_robot_in_violation():

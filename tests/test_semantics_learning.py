@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy_envs
-from reference.recording import quick_jit
+from compiling import compiled
 from reference.scenario import play
 from toy_envs import NEVER
 
@@ -48,7 +48,7 @@ def last_bias(params):
 
 def constant_policy(learner: imitation.Learner, outputs) -> imitation.PolicyState:
     """Return an ensemble whose members answer `outputs` [E, A] everywhere, before tanh or softmax."""
-    state = quick_jit(learner.init)(jax.random.key(0), IDENTITY)
+    state = compiled(learner.init)(jax.random.key(0), IDENTITY)
     return state._replace(params=constant(state.params, outputs))
 
 
@@ -74,7 +74,7 @@ def learned_targets(kind: str, steps: list[tuple[bool, bool]], config=SMALL) -> 
         after = parts.update(state, policy, key)
         return last_bias(after.opt_state.mu) / 0.1  # Adam's first mean is a tenth of the gradient
 
-    slope = np.asarray(quick_jit(gradient)(jax.random.key(0)))
+    slope = np.asarray(compiled(gradient)(jax.random.key(0)))
     return list(answers - slope / (2 * answers * (1 - answers)))  # d/db (sigmoid(b) - y)^2 = 2 (q - y) q (1 - q)
 
 
@@ -135,7 +135,7 @@ def test_semantic_12_the_goal_critic_is_pretrained_on_the_expert_and_the_safety_
     data = {"num_demonstrations": 4, "num_critic_transitions": 48, "critic_noise": 0.0}
     steps = {"pretraining_steps": 1, "critic_pretraining_steps": 1}
     config = fleetjax.make_config(env, "everything", **sizes, **data, **steps)
-    state = quick_jit(lambda key: fleetjax.prepare(config, key, env))(jax.random.key(0))
+    state = compiled(lambda key: fleetjax.prepare(config, key, env))(jax.random.key(0))
     # Twelve steps of each of four robots: one succeeds in every third, one falls in every fourth.
     for kind, positives in (("safety", 3), ("goal", 4)):
         assert int(state.estimators[kind].positives.added) == positives
@@ -168,7 +168,7 @@ def test_semantic_15_uncertainty_of_discrete_actions_is_shannon_entropy():
 @pytest.mark.parametrize(("kind", "expected"), [("safety", 0.6), ("goal", 0.3)])
 def test_semantic_15_risk_is_the_larger_twin_and_goal_the_smaller(kind, expected):
     parts = critic.make_critic(kind, SMALL, SPEC, imitation.make_learner(SMALL, SPEC))
-    state = quick_jit(parts.init)(jax.random.key(0))
+    state = compiled(parts.init)(jax.random.key(0))
     state = state._replace(params=constant(state.params, logit([0.3, 0.6])))
     np.testing.assert_allclose(parts.value(state, IDENTITY, jnp.zeros((2, 1)), jnp.zeros((2, 1))), [expected] * 2, rtol=1e-5)
 
@@ -181,7 +181,7 @@ def test_semantic_18_every_member_resamples_all_pairs_so_far_for_each_new_pair()
         pairs = imitation.Pair(jnp.ones((4, 1)), jnp.ones((4, 1)))
         return imitation.append(data, pairs, jnp.array([True, False, True, True]), key), None
 
-    data, _ = quick_jit(lambda data, keys: jax.lax.scan(add, data, keys))(data, jax.random.split(jax.random.key(0), arrivals))
+    data, _ = compiled(lambda data, keys: jax.lax.scan(add, data, keys))(data, jax.random.split(jax.random.key(0), arrivals))
     size = int(data.pairs.size)
     assert size == 3 * arrivals
     resample = np.asarray(data.resample).T
@@ -201,7 +201,7 @@ def test_semantic_18_a_member_learns_from_its_own_resample_only():
     pairs = imitation.Pair(jnp.zeros((2, 1)), jnp.array([[1.0], [-1.0]]))
     data = imitation.append(data, pairs, jnp.ones(2, bool), jax.random.key(0))
     data = data._replace(resample=jnp.array([[0, 1], [0, 1]]))  # one member sees only the first pair, one only the second
-    after, loss = quick_jit(learner.update)(state, data, jax.random.key(0))
+    after, loss = compiled(learner.update)(state, data, jax.random.key(0))
     np.testing.assert_allclose(last_bias(after.params), [3e-4, -3e-4], rtol=1e-3)  # Adam's first step is the learning rate
     assert float(loss) == pytest.approx(1.0)
 
@@ -211,7 +211,7 @@ def test_semantic_19_demonstrations_are_whole_episodes_the_last_one_cut():
     config = fleetjax.make_config(env, num_robots=4, num_humans=2, num_demonstrations=8, batch_size=4, hidden_sizes=(1,))
     supervisor = supervisors.make("toy_scripted", env)
     data = imitation.create_data(env.spec, ensemble_size=2, capacity=50)
-    data = quick_jit(lambda data, key: collect_demonstrations(config, env, supervisor, imitation.append, data, key))(
+    data = compiled(lambda data, key: collect_demonstrations(config, env, supervisor, imitation.append, data, key))(
         data, jax.random.key(0)
     )
     assert int(data.pairs.size) == 8
@@ -227,7 +227,7 @@ def test_semantic_19_evaluation_resets_at_once_from_the_start_and_learns_nothing
     learner = imitation.make_learner(config, env.spec).init(
         jax.random.key(0), Normalizer(jnp.zeros(3), jnp.ones(3), jnp.float32(10))
     )
-    result = quick_jit(lambda key, learner: fleetjax.evaluate(config, key, learner, env))(jax.random.key(0), learner)
+    result = compiled(lambda key, learner: fleetjax.evaluate(config, key, learner, env))(jax.random.key(0), learner)
     assert result.metrics.violations.tolist() == [0, 1, 0, 0, 0, 0, 1, 0]
     assert result.metrics.hard_resets.tolist() == [0, 0, 0, 0, 1, 0, 0, 0]
     assert result.metrics.human_steps.tolist() == [0, 0, 1, 1, 1, 0, 0, 1]

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy_envs
-from reference.recording import quick_jit
+from compiling import compiled
 from reference.scenario import NOBODY, play
 from toy_envs import NEVER
 
@@ -80,7 +80,7 @@ def test_semantic_16_orders_are_lexicographic():
     def score(name):
         config = fleetjax.Config().replace(uncertainty_threshold=0.2, risk_threshold=0.5)
         rule = priority.get_algorithm(name).make_priority(config)
-        return quick_jit(rule.score)(signals, (), jax.random.key(0))[0].tolist()
+        return compiled(rule.score)(signals, (), jax.random.key(0))[0].tolist()
 
     assert score("cur") == [3, 5, 4, 6, 1, 2]
     assert score("uc") == score("ensemble_dagger") == [3, 1, 5, 4, 0, 2]

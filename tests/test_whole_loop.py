@@ -78,6 +78,7 @@ def sweep(tiny) -> tuple[list[tuple[fleetjax.Config, jax.Array]], fleetjax.Confi
     return each, jax.vmap(lambda u: tiny.replace(uncertainty_threshold=u))(thresholds), keys
 
 
+@pytest.mark.slow
 def test_a_map_over_seeds_and_settings_is_a_loop_bit_for_bit(sweep):
     each, configs, keys = sweep
     together = jax.jit(lambda configs, keys: jax.lax.map(lambda x: fleetjax.run(*x), (configs, keys)))(configs, keys)
@@ -101,6 +102,7 @@ def test_a_vmap_over_seeds_and_settings_is_a_loop_but_for_roundings(tiny, sweep)
     assert together.metrics.teleop_steps.sum() > 0
 
 
+@pytest.mark.slow
 def test_a_run_has_forward_derivatives(tiny):
     """Of the imitation loss by the learning rate, against a difference of two runs."""
     config = tiny.replace(num_steps=4)

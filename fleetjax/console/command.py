@@ -6,15 +6,15 @@ import importlib.util
 import math
 import socket
 import time
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from fleetjax import envs
 from fleetjax.config import Config
 from fleetjax.console import controls
 from fleetjax.io import folder, text
-from fleetjax.io.operation import Diverged, unbegun
+from fleetjax.io.errors import Diverged
 from fleetjax.io.progress import progress, say
+from fleetjax.io.resumable import seal, unbegun
 from fleetjax.metrics import Metrics
 
 if TYPE_CHECKING:  # the rest is imported once it is known to be installed
@@ -36,32 +36,29 @@ def check(config: Config, *, host: str, port: int, token: str | None, interval: 
 
     guard.check_address(host, token)
     if not 0 <= port <= 65535:
-        raise ValueError(f"port = {port} must be in [0, 65535]; 0 takes any that is free")
+        raise ValueError(f"port = {port} must be in [0, 65535]; 0 takes any free port")
     if not (math.isfinite(interval) and interval >= 0):
         raise ValueError(f"interval = {interval} must be at least 0 seconds")
     if not (math.isfinite(timeout) and timeout > 0):
         raise ValueError(f"timeout = {timeout} must be more than 0 seconds")
     if not 0 <= wait <= config.num_humans:
-        raise ValueError(f"wait = {wait} must be in [0, {config.num_humans}], the seats that there are")
+        raise ValueError(f"wait = {wait} must be in [0, {config.num_humans}], the number of seats")
 
 
-def supervise(
-    run: folder.Run, options: "Options", listener: socket.socket, save: Callable[[folder.Run, Metrics], None]
-) -> Metrics:
-    """Run a console in a folder that is locked. An older run in it goes with the first timestep.
+def supervise(run: folder.Run, options: "Options", listener: socket.socket) -> Metrics:
+    """Run a console in a folder that is locked. An older run in it is deleted at the first timestep.
 
     Args:
         run: the run.
         options: how it is served.
         listener: bound socket.
-        save: draws and seals what there is.
 
     Returns:
         Metrics[t].
 
     Raises:
-        Diverged: if something learnt is not finite any more; what there is, is kept.
-        KeyboardInterrupt: if it was stopped before the first timestep; nothing is kept.
+        Diverged: if something learnt is no longer finite; what there is, is kept.
+        KeyboardInterrupt: if it was stopped before the first timestep.
     """
     from fleetjax.console import server
     from fleetjax.console.session import Session
@@ -85,10 +82,10 @@ def supervise(
         except (KeyboardInterrupt, Diverged):
             if not session.metrics:
                 raise unbegun(run, new=new) from None
-            save(run, session.complete())
+            seal(run, session.complete())
             raise
         if not session.metrics:
             raise unbegun(run, new=new)
         metrics = session.complete()
-        save(run, metrics)
+        seal(run, metrics)
     return metrics

@@ -13,7 +13,7 @@ class Controls(NamedTuple):
 
     Attributes:
         verb: what a key does to the robot, for people: "drive", "push".
-        hold: whether an action goes on while its key is held, and several held at once add up (clipped to [-1, 1]);
+        hold: whether an action continues while its key is held, and several held at once add up (clipped to [-1, 1]);
             else one press is one action.
         actions: f32[A] by name. Pages bind `right`, `up`, `left`, `down` to arrows and WASD, and `stop` to the space bar.
     """
@@ -42,9 +42,9 @@ def controls_of(env: Env) -> Controls:
     known = [other for other in CONTROLS if other != name]
     choose = f"choose one of {', '.join(known)}" if known else "add one to fleetjax.console.controls.CONTROLS"
     if env.picture is None:
-        raise ValueError(f"environment = {name!r} has no picture that people could look at; {choose}")
+        raise ValueError(f"environment = {name!r} has no picture for people to look at; {choose}")
     if name not in CONTROLS:
-        raise ValueError(f"environment = {name!r} has no controls that people could use; {choose}")
+        raise ValueError(f"environment = {name!r} has no controls for people to use; {choose}")
     return CONTROLS[name]
 
 
@@ -62,7 +62,7 @@ def action_of(controls: Controls, names: Sequence[str]) -> np.ndarray:
     [1.0, 1.0]
     """
     if not names or len(set(names)) < len(names) or not set(names) <= set(controls.actions):
-        raise ValueError(f"actions must be different ones out of {', '.join(controls.actions)}")
+        raise ValueError(f"actions must be distinct, and among {', '.join(controls.actions)}")
     if len(names) > 1 and not controls.hold:
         raise ValueError("one action at a time")
     return np.clip(np.sum([controls.actions[name] for name in names], axis=0), -1.0, 1.0).astype(np.float32)

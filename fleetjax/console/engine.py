@@ -1,6 +1,6 @@
 """A fleet that takes one timestep at a time, in two halves: `plan`, then people act, then `advance`.
 
-The logic is `fleetjax.fleet`'s. What people gave comes in as plain arrays, so that a record of it gives the same run again.
+The logic is `fleetjax.fleet`'s. What people gave comes in as plain arrays, so that a record of it repeats the same run.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fleetjax import supervisors
 from fleetjax.config import Config
 from fleetjax.envs import Env
-from fleetjax.fleet import FleetState, make_fleet
+from fleetjax.experiment import prepare
+from fleetjax.fleet import FleetState, make_fleet, make_parts, supervise
+from fleetjax.keys import key_at, split_keys
 from fleetjax.metrics import Metrics
-from fleetjax.run import prepare
 from fleetjax.types import EnvState, Plan, Signals
 
 EMPTY, PERSON, SIMULATED = 0, 1, 2  # who sits in a seat
@@ -29,7 +29,7 @@ class Inputs(NamedTuple):
         seat: u8[M] who sat there: `EMPTY`, `PERSON` or `SIMULATED`.
         given: bool[M] whether a person gave an action.
         action: f32[M, A] that action; 0 where there is none.
-        confirmed: bool[M] whether a person wants the hard reset of the robot to go on.
+        confirmed: bool[M] whether a person confirmed the hard reset of the robot.
     """
 
     seat: np.ndarray
@@ -75,8 +75,8 @@ class Programs(NamedTuple):
 
     Attributes:
         prepare: `(Config, key) -> FleetState`.
-        plan: `(Config, key of all timesteps, FleetState, seat u8[M]) -> (priority's memory, Plan)`.
-        advance: `(Config, key of all timesteps, store, rest, Plan, Inputs) -> (FleetState, Metrics)`; see `_split`.
+        plan: `(Config, key of the run, FleetState, seat u8[M]) -> (priority's memory, Plan)`.
+        advance: `(Config, key of the run, store, rest, Plan, Inputs) -> (FleetState, Metrics)`; see `_split`.
         draw: `(EnvState[N], robots i32[K]) -> u8[K, H, W, 3]`, by K.
     """
 
@@ -138,7 +138,7 @@ class Engine:
             self.state: FleetState = prepared.result()
         finally:
             pool.shutdown(wait=False)
-        _, self._key_steps = jax.random.split(key)
+        self._key = key
         self._planned: Plan | None = None
 
     @property
@@ -152,7 +152,7 @@ class Engine:
         Args:
             seat: u8[M] who sits in each seat.
         """
-        memory, planned = self._programs.plan(self.config, self._key_steps, self.state, seat)
+        memory, planned = self._programs.plan(self.config, self._key, self.state, seat)
         self.state, self._planned = self.state._replace(priority=memory), planned
         plan = jax.device_get(planned._replace(robot_action=None, signals=Signals(*planned.signals[:5])))
         signals = plan.signals
@@ -166,7 +166,7 @@ class Engine:
             inputs: what they did, in the seats that the timestep began with.
         """
         store, rest = _split(self.state)
-        self.state, metrics = self._programs.advance(self.config, self._key_steps, store, rest, self._planned, inputs)
+        self.state, metrics = self._programs.advance(self.config, self._key, store, rest, self._planned, inputs)
         self._planned = None
         return jax.device_get(metrics)
 
@@ -182,22 +182,18 @@ def _split(state: FleetState) -> tuple[Any, FleetState]:
 
 def _halves(config: Config, env: Env) -> tuple[Any, Any]:
     """Return the two halves of a timestep as pure functions."""
-    supervisor = supervisors.make(config.supervisor or env.spec.supervisor, env)
     num_robots = config.num_robots
 
-    def keys(key_steps: jax.Array, state: FleetState) -> jax.Array:
-        return jax.random.split(jax.random.fold_in(key_steps, state.timestep), 3)  # plan, human, advance
-
-    def plan(config: Config, key_steps: jax.Array, state: FleetState, seat: jax.Array) -> tuple[Any, Plan]:
-        after, planned = make_fleet(config, env).plan(state, keys(key_steps, state)[0], jnp.asarray(seat) != EMPTY)
+    def plan(config: Config, key: jax.Array, state: FleetState, seat: jax.Array) -> tuple[Any, Plan]:
+        after, planned = make_fleet(config, env).plan(state, key_at(key, state.timestep), jnp.asarray(seat) != EMPTY)
         return after.priority, planned
 
     def advance(
-        config: Config, key_steps: jax.Array, store: Any, rest: FleetState, plan: Plan, inputs: Inputs
+        config: Config, key: jax.Array, store: Any, rest: FleetState, plan: Plan, inputs: Inputs
     ) -> tuple[FleetState, Metrics]:
         state = rest._replace(human_data=store[0], estimators=store[1])
-        _, key_human, key_advance = keys(key_steps, state)
-        action = jax.vmap(supervisor.act)(state.env, jax.random.split(key_human, num_robots))
+        key_step = key_at(key, state.timestep)
+        action = supervise(make_parts(config, env), state.env, split_keys(key_step, num_robots))
         simulated = jnp.asarray(inputs.seat) == SIMULATED
         place = jnp.where(plan.humans.robot >= 0, plan.humans.robot, num_robots)
 
@@ -207,6 +203,6 @@ def _halves(config: Config, env: Env) -> tuple[Any, Any]:
         theirs = jnp.where(inputs.given & ~simulated, place, num_robots)
         action = action.at[theirs].set(inputs.action, mode="drop")
         plan = plan._replace(resetting=plan.resetting & by_robot(simulated | inputs.confirmed))
-        return make_fleet(config, env).advance(state, plan, action, by_robot(simulated | inputs.given), key_advance)
+        return make_fleet(config, env).advance(state, plan, action, by_robot(simulated | inputs.given), key_step)
 
     return plan, advance

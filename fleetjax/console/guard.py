@@ -58,7 +58,7 @@ class Guard:
     Args:
         app: what is guarded.
         host: the address that is served.
-        token: what every page needs; None = nothing.
+        token: what every page needs; None = no token.
     """
 
     def __init__(self, app: ASGIApp, host: str, token: str | None):
@@ -92,7 +92,7 @@ class Guard:
         """Return what a request gets instead of the page; None if nothing is wrong with it."""
         headers = Headers(scope=scope)
         if not self._is_here(headers.getlist("host")):
-            return PlainTextResponse("The console has another host name.\n", 421)
+            return PlainTextResponse("This is not a host name of the console.\n", 421)
         if scope["type"] == "websocket" and not _same_host(headers.getlist("origin"), headers["host"]):
             return PlainTextResponse("WebSockets are for the console's own pages.\n", 403)
         if self.token is None:

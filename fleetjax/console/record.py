@@ -1,4 +1,4 @@
-"""The record of what people did: a row a timestep, from which the run can be made again."""
+"""The record of what people did: one row per timestep, from which the run can be repeated."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ def row_type(config: Config, spec: EnvSpec) -> np.dtype:
 
 
 def open_record(path: Path) -> files.Log:
-    """Begin the record of a run."""
+    """Start the record of a run."""
     return files.Log(path / folder.RECORD)
 
 
@@ -45,7 +45,7 @@ def parse(data: bytes, config: Config, spec: EnvSpec) -> np.ndarray:
     in_order = np.array_equal(rows["timestep"], np.arange(len(rows)))
     in_range = rows["seat"].max() <= SIMULATED and max(rows["given"].max(), rows["confirmed"].max()) <= 1
     if not (in_order and in_range and np.all(np.isfinite(rows["action"]))):
-        raise ValueError("its rows are not those of a console")
+        raise ValueError("its rows are not a console's")
     return rows
 
 

@@ -159,7 +159,7 @@ class Seats:
         seat.action = action
 
     def confirm(self, client: Hashable, robot: int, since: int) -> None:
-        """Begin the hard reset that a person wants; it goes on until it is done.
+        """Begin the hard reset that a person wants; it continues until it is completed.
 
         Raises:
             Refused: if the robot is not theirs, or is in no violation.
@@ -179,7 +179,7 @@ class Seats:
         return seat
 
     def collect(self, kinds: np.ndarray, action_size: int) -> Inputs:
-        """Return what was done at the timestep that began with `kinds`; actions are used up, confirmed resets go on."""
+        """Return what was done at the timestep that began with `kinds`; actions are used up, confirmed resets continue."""
         there = [kind == PERSON and seat.robot >= 0 for seat, kind in zip(self.seats, kinds, strict=True)]
         pairs = list(zip(self.seats, there, strict=True))
         actions = [seat.action if yes and seat.action is not None else np.zeros(action_size, np.float32) for seat, yes in pairs]

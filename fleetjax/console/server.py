@@ -46,11 +46,11 @@ class Options(NamedTuple):
 
     Attributes:
         host: address that is served.
-        port: 0 = any.
-        token: what every page needs; None = nothing.
-        interval: seconds a timestep.
+        port: 0 = any free one.
+        token: what every page needs; None = no token.
+        interval: seconds per timestep.
         timeout: seconds of silence after which a seat is free.
-        wait: people without whom the first timestep does not begin.
+        wait: people to wait for before the first timestep.
         simulated: whether the simulated supervisor plays seats that nobody takes.
     """
 
@@ -166,7 +166,7 @@ class Console:
             sending.cancel()
 
     def _hear(self, client: Client, text: str | None) -> None:
-        """Do what a page asks for, or tell it why not; one that is being closed is not heard any more."""
+        """Do what a page asks for, or tell it why not; one that is being closed is no longer heard."""
         if client.closing:
             return
         client.heard += 1

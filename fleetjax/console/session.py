@@ -6,8 +6,8 @@ import numpy as np
 from fleetjax import envs
 from fleetjax.console import record
 from fleetjax.console.engine import Engine, Inputs, View
-from fleetjax.io import execution, files, folder, text
-from fleetjax.io.operation import Diverged
+from fleetjax.io import chunks, files, folder, metrics_csv, text
+from fleetjax.io.errors import Diverged
 from fleetjax.metrics import Metrics, first_divergence
 from fleetjax.priority import get_algorithm
 
@@ -50,27 +50,27 @@ class Session:
         return self._view
 
     def finish(self, inputs: Inputs) -> Metrics:
-        """Complete the timestep and write it down; return its Metrics[1]. With the first, an older run in the folder goes.
+        """Complete the timestep and write it down; return its Metrics[1]. The first deletes an older run in the folder.
 
         Raises:
             OSError: if it cannot be written.
-            Diverged: if what is learnt is not finite any more.
+            Diverged: if something learnt is no longer finite.
         """
         assert self._view is not None
         view, self._view = self._view, None
         metrics = as_chunk(self.engine.advance(inputs))
         if not self._logs:
             folder.create(self.run)
-            self._logs = record.open_record(self.run.folder), folder.open_metrics(self.run.folder)
+            self._logs = record.open_record(self.run.folder), metrics_csv.open_log(self.run.folder)
         log, table = self._logs
         record.append(log, view, inputs, self._rows)
-        folder.append_metrics(table, metrics, view.timestep)
+        metrics_csv.append(table, metrics, view.timestep)
         self.metrics.append(metrics)
         self._total = {name: self._total[name] + more for name, more in text.add_up(metrics).items()}
         self.curves.append(self._heights())
         found = first_divergence(metrics)
         if found:
-            raise Diverged(f"not finite from t = {view.timestep} on: {', '.join(found[1])}; a smaller learning_rate may help")
+            raise Diverged(f"not finite from t = {view.timestep} on: {', '.join(found[1])}; try a smaller learning_rate")
         return metrics
 
     def _heights(self) -> tuple[float, float, float, float]:
@@ -83,7 +83,7 @@ class Session:
             log.mark()
         if get_algorithm(self.config.algorithm).pretrains:
             folder.write_policy(self.run.folder, self.engine.state.policy)
-        return execution.join(self.metrics)
+        return chunks.join(self.metrics)
 
     def close(self) -> None:
         """Close the files."""

@@ -102,7 +102,9 @@ def _adapt(raw: Any, name: str, *, supervisor: str, horizon: int, success_return
         )
 
     size = jax.eval_shape(_observation, first.obs).shape[-1]
-    spec = base.EnvSpec(name, size, raw.action_size, horizon, float(raw.dt), supervisor=supervisor)
+    spec = base.EnvSpec(
+        name, size, raw.action_size, horizon, float(raw.dt), supervisor=supervisor, success_return=success_return
+    )
     return base.Env(reset, step, spec)
 
 

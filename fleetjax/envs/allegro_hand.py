@@ -1,8 +1,9 @@
 """Allegro hand: 16 position servos turn a cube to random orientations, one goal after the other (paper, Section 5.1).
 
-An action changes the angles that the servos hold, as `useRelativeControl` of the Isaac Gym task does, where it is off: policies
-that set the angles themselves cannot be cloned from a few episodes. Other differences from the Isaac Gym task, where a reading of it was unclear or mistaken: joint torques are the servos', not
-readings that are always zero; no joint starts outside its limits; an episode starts with the cube at rest in the hand.
+An action changes the angles that the servos hold. The Isaac Gym task has this as an option (`useRelativeControl`), off by
+default; policies that set the angles themselves cannot be cloned from a few episodes. Other differences from that task, where a
+reading of it was unclear or mistaken: joint torques are the servos', not readings that are always zero; no joint starts outside
+its limits; an episode starts with the cube at rest in the hand.
 """
 
 import functools

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from fleetjax import expert_records
 from fleetjax.envs import base
 from fleetjax.envs.rotation import rotation_matrix
 from fleetjax.physics.base import PhysicsState, make_physics
@@ -48,11 +49,19 @@ def make_env(*, backend: str = "auto", success_return: float | None = None) -> b
             and 95 % of the shipped expert's mean return over episodes of full length.
     """
     if success_return is None:
-        from fleetjax.supervisors import expert
-
-        success_return = expert.success_return("anymal", SUCCESS_FLOOR)
+        success_return = expert_records.success_return("anymal", SUCCESS_FLOOR)
     physics = make_physics("anymal.xml", substeps=SUBSTEPS, backend=backend)
-    spec = base.EnvSpec("anymal", 48, physics.model.nu, HORIZON, physics.control_step, supervisor="anymal")
+    spec = base.EnvSpec(
+        "anymal",
+        48,
+        physics.model.nu,
+        HORIZON,
+        physics.control_step,
+        supervisor="anymal",
+        success_return=success_return,
+    )
+        "anymal", 48, physics.model.nu, HORIZON, physics.control_step, supervisor="anymal", success_return=success_return
+    )
 
     def reset(key: jax.Array, robot: jax.Array) -> EnvState:
         del robot  # every robot starts from the same distribution

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from fleetjax import expert_records
 from fleetjax.envs import base
 from fleetjax.envs.rotation import rotation_matrix
 from fleetjax.physics.base import Physics, PhysicsState, make_physics
@@ -30,11 +31,19 @@ def make_env(*, backend: str = "auto", success_return: float | None = None) -> b
             and 95 % of the shipped expert's mean return over episodes of full length.
     """
     if success_return is None:
-        from fleetjax.supervisors import expert
-
-        success_return = expert.success_return("humanoid", SUCCESS_FLOOR)
+        success_return = expert_records.success_return("humanoid", SUCCESS_FLOOR)
     physics = make_physics("humanoid.xml", substeps=SUBSTEPS, backend=backend)
-    spec = base.EnvSpec("humanoid", 108, physics.model.nu, HORIZON, physics.control_step, supervisor="humanoid")
+    spec = base.EnvSpec(
+        "humanoid",
+        108,
+        physics.model.nu,
+        HORIZON,
+        physics.control_step,
+        supervisor="humanoid",
+        success_return=success_return,
+    )
+        "humanoid", 108, physics.model.nu, HORIZON, physics.control_step, supervisor="humanoid", success_return=success_return
+    )
     joints = _Joints(physics.model)
 
     def reset(key: jax.Array, robot: jax.Array) -> EnvState:

@@ -1,7 +1,7 @@
 """Checkpoints of a running fleet: orbax stores the arrays, and a manifest with their SHA-256 is written last and checked first.
 
-A checkpoint is a folder named by its timestep. Without a manifest it is unfinished and never read; with one whose digests do
-not match it is damaged, and an older one is taken. orbax itself restores flipped bits without a word.
+A checkpoint is a folder named by its timestep. Without a manifest it is unfinished and never read. If the digests do not match,
+it is damaged, and an older one is used. orbax itself restores flipped bits without an error.
 """
 
 import contextlib
@@ -31,7 +31,7 @@ class Checkpoint(NamedTuple):
     Attributes:
         path: where it is.
         state: the fleet.
-        notes: what was noted down with it.
+        notes: what was noted with it.
     """
 
     path: Path
@@ -44,7 +44,7 @@ class Writer:
 
     Args:
         folder: folder of the run.
-        identity: plain values that tell this run from others.
+        identity: plain values that distinguish this run from others.
     """
 
     def __init__(self, folder: Path, identity: Mapping[str, Any]):
@@ -53,10 +53,10 @@ class Writer:
         self._pending: Future[None] | None = None
 
     def write(self, state: FleetState, notes: Mapping[str, Any]) -> None:
-        """Copy the state, and write it in the background once the one before is finished.
+        """Copy the state, and write it in the background once the previous one is written.
 
         Raises:
-            OSError: if the one before could not be written.
+            OSError: if the previous one could not be written.
         """
         self.wait()
         arrays = _named(state, lambda x: np.array(jax.device_get(_plain(x))))
@@ -66,7 +66,7 @@ class Writer:
         """Wait until nothing is being written.
 
         Raises:
-            OSError: if it could not be written; those before are as they were.
+            OSError: if it could not be written; older ones are unchanged.
         """
         pending, self._pending = self._pending, None
         if pending:
@@ -84,14 +84,14 @@ class Writer:
             shutil.rmtree(path, ignore_errors=True)
             raise OSError(f"the checkpoint at t = {timestep} could not be written ({files.one_line(error)})") from error
         found = _found(self.folder)
-        kept = [whole for whole in found if (whole / MANIFEST).exists()][-KEPT:]
+        kept = [path for path in found if (path / MANIFEST).exists()][-KEPT:]
         for other in found:
             if other not in kept:
                 shutil.rmtree(other)
 
 
 def clear(folder: Path) -> None:
-    """Remove the checkpoints of a run; what others left among them stays."""
+    """Delete the checkpoints of a run; foreign files among them stay."""
     for path in _found(folder / FOLDER):
         shutil.rmtree(path)
     with contextlib.suppress(OSError):  # there is no such folder, or it holds files of others
@@ -99,19 +99,19 @@ def clear(folder: Path) -> None:
 
 
 def is_any_finished(folder: Path) -> bool:
-    """Return whether a run has a checkpoint that was finished, be it damaged since."""
+    """Return whether a run has a checkpoint that was finished, even one that is damaged now."""
     return any((path / MANIFEST).exists() for path in _found(folder / FOLDER))
 
 
 def _found(folder: Path) -> list[Path]:
-    """Return the checkpoints in a folder, finished or not, oldest first; what others left there is none."""
+    """Return the checkpoints in a folder, finished or not, oldest first; foreign files are ignored."""
     return sorted(path for path in folder.glob("[0-9]" * 10) if path.is_dir() and not path.is_symlink())
 
 
 def restore(
     folder: Path, identity: Mapping[str, Any], shapes: FleetState, check: Callable[[Checkpoint], Any]
 ) -> tuple[Checkpoint | None, list[str]]:
-    """Read the newest checkpoint of a run that is whole.
+    """Read the newest intact checkpoint of a run.
 
     Args:
         folder: folder of the run.
@@ -120,7 +120,7 @@ def restore(
         check: raises ValueError for a checkpoint that does not fit the run's other files.
 
     Returns:
-        The checkpoint, None if there is none, and for each newer one why it cannot be used.
+        The checkpoint, or None if there is none, and for each newer one the reason why it cannot be used.
     """
     refused = []
     for path in reversed(_found(folder / FOLDER)):
@@ -137,7 +137,7 @@ def _read(path: Path, identity: Mapping[str, Any], shapes: FleetState) -> Checkp
     """Read a checkpoint.
 
     Raises:
-        ValueError: if it is unfinished, damaged or another run's.
+        ValueError: if it is unfinished, damaged or belongs to another run.
     """
     if not (path / MANIFEST).exists():
         raise ValueError("it was never finished")
@@ -146,18 +146,18 @@ def _read(path: Path, identity: Mapping[str, Any], shapes: FleetState) -> Checkp
     except (ValueError, RecursionError):
         raise ValueError(f"{MANIFEST} is damaged") from None
     if not isinstance(manifest, dict) or not isinstance(manifest.get("notes"), dict):
-        raise ValueError(f"{MANIFEST} is not fleetjax's")
+        raise ValueError(f"{MANIFEST} was not written by fleetjax")
     if any(manifest.get(name) != value for name, value in identity.items()):
-        raise ValueError("it is another run's")
+        raise ValueError("it belongs to another run")
     if manifest.get("sha256") != _digests(path):
-        raise ValueError("its SHA-256 are not those of its manifest, so it is damaged")
-    wanted = _named(shapes, lambda x: np.zeros(*_layout(x)))
-    found = _checkpointer(lambda orbax: orbax.restore((path / ARRAYS).absolute(), wanted))
+        raise ValueError("its SHA-256 digests do not match the manifest, so it is damaged")
+    template = _named(shapes, lambda x: np.zeros(*_layout(x)))
+    found = _checkpointer(lambda orbax: orbax.restore((path / ARRAYS).absolute(), template))
     names, leaves = zip(*jax.tree_util.tree_leaves_with_path(shapes), strict=True)
     arrays = [_restored(found, jax.tree_util.keystr(name), leaf) for name, leaf in zip(names, leaves, strict=True)]
     state: FleetState = jax.tree.unflatten(jax.tree.structure(shapes), arrays)
     if int(state.timestep) != manifest.get("timestep"):
-        raise ValueError("its timestep is not that of its manifest")
+        raise ValueError("its timestep does not match the manifest")
     return Checkpoint(path, state, manifest["notes"])
 
 
@@ -204,7 +204,7 @@ def _layout(leaf: Any) -> tuple[tuple[int, ...], Any]:
 
 
 def _named(state: FleetState, value: Callable[[Any], np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the value of each leaf by its name; orbax does not take empty arrays, so they are left out."""
+    """Return the value of each leaf by its name; without empty arrays, which orbax does not take."""
     leaves = jax.tree_util.tree_leaves_with_path(state)
     return {jax.tree_util.keystr(name): value(leaf) for name, leaf in leaves if leaf.size}
 
@@ -218,11 +218,11 @@ def _restored(found: Mapping[str, np.ndarray], name: str, leaf: Any) -> jax.Arra
     shape, dtype = _layout(leaf)
     array = found[name] if leaf.size else np.zeros(shape, dtype)
     if (array.shape, array.dtype) != (shape, dtype):
-        raise ValueError(f"{name} is {array.dtype}{list(array.shape)}, and {dtype}{list(shape)} is wanted")
+        raise ValueError(f"{name} is {array.dtype}{list(array.shape)}, expected {dtype}{list(shape)}")
     restored = jnp.array(array)  # a copy, whose memory a run may take over
     restored = jax.random.wrap_key_data(restored) if _is_key(leaf) else restored
     if restored.dtype != leaf.dtype:
-        raise ValueError(f"{name} is {restored.dtype}, and {leaf.dtype} is wanted")
+        raise ValueError(f"{name} is {restored.dtype}, expected {leaf.dtype}")
     return restored
 
 

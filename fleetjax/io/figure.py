@@ -1,4 +1,7 @@
-"""The paper's four curves: cumulative successes, hard resets and idle time, and the return on human effort."""
+"""The paper's four curves: cumulative successes, violations and idle time, and the return on human effort.
+
+The paper calls violations hard resets.
+"""
 
 import io
 from collections.abc import Sequence
@@ -15,10 +18,10 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from fleetjax.config import Config
 from fleetjax.io import text
-from fleetjax.io.folder import to_plain
+from fleetjax.io.plain import to_plain
 from fleetjax.metrics import Metrics, rohe
 
-PANELS = ("Cumulative successes", "Cumulative hard resets", "Cumulative idle timesteps", "Return on human effort")
+PANELS = ("Cumulative successes", "Cumulative violations", "Cumulative idle timesteps", "Return on human effort")
 _LEGEND_WIDTH = 165  # letters that fit into a row
 FORMATS = (".png", ".pdf", ".svg")
 # Okabe and Ito's palette: told apart with every common kind of colour vision. One colour for an algorithm, always.

@@ -1,4 +1,4 @@
-"""Files that survive: written whole or not at all, appended to and cut back, locked."""
+"""Files that survive a crash: written completely or not at all, appended to and cut back, locked."""
 
 import contextlib
 import fcntl
@@ -27,7 +27,7 @@ def write(path: Path, data: bytes) -> None:
 
 
 def check_place(path: Path) -> None:
-    """Check that a file can be written, by writing another beside it: permissions alone do not tell.
+    """Check that a file can be written by writing another beside it, since permissions alone do not tell.
 
     Raises:
         OSError: if it cannot.
@@ -40,6 +40,30 @@ def check_place(path: Path) -> None:
             pass
     except OSError as error:
         raise OSError(f"{path} cannot be written: {error.strerror}") from None
+
+
+def check_free(path: Path, *, overwrite: bool, is_folder: bool = False) -> Path:
+    """Check that an output can be written without loss, before it is computed.
+
+    Args:
+        path: where it is to go.
+        overwrite: whether it may replace what is there.
+        is_folder: whether it is a folder; else it is a file.
+
+    Returns:
+        Path: where to write it: in place of a link, its target.
+
+    Raises:
+        FileExistsError: if something is there that is not an empty folder, unless `overwrite`.
+        OSError: if it cannot be written there.
+    """
+    if os.path.lexists(path) and not overwrite and not (is_folder and path.is_dir() and not any(path.iterdir())):
+        raise FileExistsError(f"{path} exists already; pass --overwrite to replace it")
+    if path.exists() and path.is_dir() != is_folder:
+        raise FileExistsError(f"{path} is a {'file' if path.is_file() else 'folder'}; choose another --output")
+    target = Path(os.path.realpath(path))
+    check_place(target)
+    return target
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -61,10 +85,10 @@ def one_line(error: BaseException) -> str:
 
 @contextlib.contextmanager
 def lock(folder: Path) -> Iterator[None]:
-    """Keep other processes out of a folder, until the block ends or the process does, however it ends.
+    """Keep other processes out of a folder until the block or the process ends, however it ends.
 
     Raises:
-        BlockingIOError: if another process has it.
+        BlockingIOError: if another process holds it.
     """
     path = folder / LOCK
     with contextlib.ExitStack() as held:
@@ -74,7 +98,7 @@ def lock(folder: Path) -> Iterator[None]:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 file.seek(0)
-                raise BlockingIOError(f"{folder} is in use by process {file.read().strip() or 'of unknown number'}") from None
+                raise BlockingIOError(f"{folder} is in use by process {file.read().strip() or '(number unknown)'}") from None
             if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
                 break  # and not a file that its last owner has removed meanwhile
         file.truncate(0)
@@ -91,10 +115,10 @@ class Log:
 
     Args:
         path: the file.
-        mark: what `mark` returned when the file was as it shall be again; None begins a new file.
+        mark: what `mark` returned when the file had the content to return to; None starts a new file.
 
     Raises:
-        ValueError: if the file did not begin as it did then.
+        ValueError: if the file no longer begins with that content.
     """
 
     def __init__(self, path: Path, mark: Mapping[str, Any] | None = None):
@@ -109,10 +133,10 @@ class Log:
             self._file = path.open("wb")
 
     def append(self, data: bytes) -> None:
-        """Add bytes; they are with the operating system when this returns.
+        """Add bytes; the operating system has them when this returns.
 
         Raises:
-            OSError: if it does not take them; the error names the file.
+            OSError: if they cannot be written; the error names the file.
         """
         try:
             self._file.write(data)
@@ -122,12 +146,12 @@ class Log:
         self._digest.update(data)
 
     def mark(self) -> dict[str, Any]:
-        """Put what was appended on the disk; return what `Log` needs to cut the file back to this."""
+        """Put what was appended on the disk; return what `Log` needs to cut the file back to this length."""
         os.fsync(self._file.fileno())
         return {"size": self._file.tell(), "sha256": self._digest.hexdigest()}
 
     def close(self) -> None:
-        """Close the file; what it did not take before is lost."""
+        """Close the file; what could not be written is lost."""
         with contextlib.suppress(OSError):
             self._file.close()
 
@@ -136,15 +160,25 @@ def beginning(path: Path, mark: Any) -> bytes:
     """Return what a file held when it was marked.
 
     Raises:
-        ValueError: if it does not hold it any more.
+        ValueError: if it no longer holds it.
     """
     size = mark.get("size") if isinstance(mark, Mapping) else None
     if not isinstance(size, int):
-        raise ValueError(f"{path.name} is not noted there")
+        raise ValueError(f"{path.name} is not in its manifest")
     if not path.is_file():
         raise ValueError(f"{path.name} is missing")
     with path.open("rb") as file:
         data = file.read(min(size, path.stat().st_size))
     if digest(data) != mark.get("sha256"):
-        raise ValueError(f"{path.name} is not as it was at that time")
+        raise ValueError(f"{path.name} has changed since")
     return data
+
+
+def expect(holds: bool, otherwise: str) -> None:
+    """Check something about the content of a file.
+
+    Raises:
+        ValueError: if it does not hold.
+    """
+    if not holds:
+        raise ValueError(otherwise)

@@ -1,4 +1,4 @@
-"""What can be typed: commands and flags, a flag for each field of `Config`."""
+"""What can be typed: commands and flags, a flag for each parameter. Nothing here loads JAX, so that help comes at once."""
 
 import argparse
 import difflib
@@ -9,10 +9,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NoReturn
 
-from fleetjax.config import FIELDS, every_field, owners
-from fleetjax.envs import get_defaults, list_envs
-from fleetjax.field import Field
-from fleetjax.io.export import FORMATS
+from fleetjax.environments import get_defaults, list_envs
+from fleetjax.field import FIELDS, Field, every_field, owners
+from fleetjax.io.errors import Refusal
+from fleetjax.io.formats import FORMATS
 from fleetjax.registry import unknown
 from fleetjax.version import VERSION
 
@@ -22,22 +22,18 @@ PORT = 8765  # that a console serves
 _ABOUT = """\
 Interactive fleet learning: N robots, M humans. Who should get help, and what does the fleet gain?
 
-  fleetjax run navigation               a fleet that is done in a minute
+  fleetjax run navigation               a small fleet, finished in a minute
   fleetjax run humanoid                 the paper's main experiment, C.U.R. with 100 humanoids
   fleetjax run humanoid --help          every parameter, with its meaning, unit and default
-  fleetjax plot runs/humanoid-*         runs in one figure, seeds as mean and band
-  fleetjax evaluate RUN                 the trained policy on its own, nobody teleoperates
+  fleetjax plot runs/humanoid-*         runs in one figure; seeds become a mean and a band
+  fleetjax evaluate RUN                 the trained policy on its own; nobody teleoperates
   fleetjax console navigation --humans 2   real people supervise, in their browsers"""
 _RUN_ABOUT = """\
-Clone demonstrations, then run the fleet while it learns from those who help it. Ends with a table, and a run folder that
-holds config.json, metrics.csv (a row a timestep), figure.png, policy.msgpack and the last two checkpoints."""
+Clone demonstrations, then run the fleet while it learns from those who help it. Prints a table at the end and writes a run
+folder: config.json, metrics.csv (one row per timestep), figure.png, policy.msgpack and the last two checkpoints."""
 _RUN_NOTE = """\
-Some algorithms have defaults of their own: expert has as many humans as robots; constraint has the human time of C.U.R. as
-extra demonstrations, and constraint_trained has, besides, as many gradient steps before the start as others have in all."""
-
-
-class Refusal(Exception):
-    """Input that cannot be used; the message is for the user."""
+Some algorithms change defaults: expert has as many humans as robots; constraint gets as many extra demonstrations as C.U.R.
+uses human timesteps; constraint_trained also takes as many gradient steps before the start as the others take in total."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -59,21 +55,21 @@ class _Parser(argparse.ArgumentParser):
     def _stray(self, extra: Sequence[str]) -> str:
         flags = [word for word in extra if word.startswith("-")]
         if not flags:
-            return f"unexpected argument {extra[0]!r}; {self.prog} --help tells what can be given"
+            return f"unexpected argument {extra[0]!r}; see {self.prog} --help"
         flag = flags[0].split("=")[0]
         close = difflib.get_close_matches(flag, list(self._option_string_actions), n=1, cutoff=0.0)
         return f"unknown flag {flag}; the closest is {close[0]}"
 
 
-_EXPORT_ABOUT = """Write what humans who teleoperated saw and did, an episode for each intervention, as other tools read it. The
+_EXPORT_ABOUT = """Write what teleoperating humans saw and did as a data set for other tools, one episode per intervention. The
 run must have been made with --log-interventions."""
 _RENDER_ABOUT = """Draw robots as an animation, a grid of tiles. Teleoperated robots are tinted blue, robots in violation red.
 
-expert: the supervisor acts on every robot. robot: the trained policy of a run acts, and nobody teleoperates. mixed: the fleet
-as it runs, from its pre-training on, with humans who come to help."""
+expert: the supervisor acts on every robot. robot: the trained policy of a run acts, and nobody teleoperates. mixed: the
+pre-trained fleet runs, and its humans help."""
 _CONSOLE_ABOUT = """Run a fleet one timestep at a time, with people as supervisors: each opens a page, gets a seat, and helps
 the robot that the algorithm allocates. Ends with a table and a run folder as `fleetjax run` does, and a record of what people
-did, from which `fleetjax replay` makes the run again."""
+did, so that `fleetjax replay` can repeat the run."""
 
 
 def parse(argv: Sequence[str]) -> argparse.Namespace:
@@ -98,7 +94,7 @@ def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser
     _add_run(commands, environment)
     commands.add_parser("list", help="show environments and algorithms")
 
-    plot = commands.add_parser("plot", help="draw runs in one figure, seeds as mean and band")
+    plot = commands.add_parser("plot", help="draw runs in one figure; seeds become a mean and a band")
     plot.add_argument("runs", metavar="RUN", nargs="+", type=Path, help="run folder")
     plot.add_argument(
         "--output", metavar="FILE", type=Path, default=Path("fleetjax.png"), help="png, pdf or svg [default: fleetjax.png]"
@@ -113,7 +109,7 @@ def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser
 
     export = commands.add_parser("export", help="write a run's interventions as a data set", description=_EXPORT_ABOUT)
     export.add_argument("run", metavar="RUN", type=Path, help="run folder")
-    export.add_argument("--format", choices=FORMATS, required=True, help="of the data set")
+    export.add_argument("--format", choices=FORMATS, required=True, help="format of the data set")
     export.add_argument(
         "--output",
         metavar="PATH",
@@ -129,7 +125,7 @@ def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser
     render.add_argument("--num-shown", metavar="N", type=_integer, default=4, help="robots in the picture [default: 4]")
     render.add_argument("--num-steps", metavar="N", type=_integer, default=200, help="timesteps to draw [default: 200]")
     render.add_argument("--skip", metavar="N", type=_integer, default=0, help="timesteps to run before them [default: 0]")
-    render.add_argument("--every", metavar="N", type=_integer, default=2, help="timesteps a picture [default: 2]")
+    render.add_argument("--every", metavar="N", type=_integer, default=2, help="timesteps per picture [default: 2]")
     render.add_argument(
         "--width", metavar="N", type=_integer, default=320, help="width of a robot's tile (pixels) [default: 320]"
     )
@@ -139,8 +135,8 @@ def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser
     )
     render.add_argument("--overwrite", action="store_true", help="replace an existing file")
     _add_console(commands, environment)
-    replay = commands.add_parser("replay", help="run a console's session again from its record, and compare every bit")
-    replay.add_argument("run", metavar="RUN", type=Path, help="run folder of a console")
+    replay = commands.add_parser("replay", help="repeat a console session from its record, and compare every bit")
+    replay.add_argument("run", metavar="RUN", type=Path, help="run folder of a console session")
     return parser, list(commands.choices)
 
 
@@ -150,7 +146,7 @@ def _add_run(commands: Any, environment: str | None) -> None:
     run = commands.add_parser("run", help="run a fleet", usage=usage, description=_RUN_ABOUT, epilog=_RUN_NOTE)
     environments = f"environment: {', '.join(list_envs())}"
     run.add_argument("environment", metavar="ENV", nargs="?", default=argparse.SUPPRESS, help=environments)
-    run.add_argument("--resume", metavar="RUN", type=Path, help="go on with a run that was stopped, from its last checkpoint")
+    run.add_argument("--resume", metavar="RUN", type=Path, help="resume a stopped run from its newest intact checkpoint")
     run.add_argument("--seed", metavar="N", type=_seed, help="random seed [default: 0]")
     run.add_argument("--output", metavar="DIR", type=Path, help="run folder [default: a new one below runs/]")
     run.add_argument("--overwrite", action="store_true", help="replace the run in an existing folder")
@@ -162,7 +158,7 @@ def _add_run(commands: Any, environment: str | None) -> None:
         help="timesteps between checkpoints, of which the last two are kept; 0 = none [default: 1000]",
     )
     run.add_argument(
-        "--log-interventions", action="store_true", help="log what humans who teleoperate see and do, for `fleetjax export`"
+        "--log-interventions", action="store_true", help="log what teleoperating humans see and do, for `fleetjax export`"
     )
     _add_parameters(run, environment)
 
@@ -173,19 +169,23 @@ def _add_console(commands: Any, environment: str | None) -> None:
         "console", help="let people supervise a fleet in their browsers", usage=usage, description=_CONSOLE_ABOUT
     )
     console.add_argument("environment", metavar="ENV", nargs="?", default=argparse.SUPPRESS, help="environment with pictures")
-    console.add_argument("--host", default="127.0.0.1", help="address to serve; others than this machine's own need --token")
-    console.add_argument("--port", metavar="N", type=_integer, default=PORT, help=f"0 = any that is free [default: {PORT}]")
-    console.add_argument("--token", help="what every page then needs, as ?token=TOKEN; 8 or more letters and digits")
-    console.add_argument("--interval", metavar="X", type=_number, help="seconds a timestep [default: the control step]")
+    console.add_argument("--host", default="127.0.0.1", help="address to listen on; any but this machine's own needs --token")
+    console.add_argument("--port", metavar="N", type=_integer, default=PORT, help=f"port; 0 = any free one [default: {PORT}]")
+    console.add_argument("--token", help="token that pages need as ?token=TOKEN; at least 8 letters and digits")
+    console.add_argument("--interval", metavar="X", type=_number, help="seconds per timestep [default: the control step]")
     console.add_argument(
-        "--timeout", metavar="X", type=_number, default=10.0, help="seconds until a lost person's seat is free [default: 10]"
+        "--timeout",
+        metavar="X",
+        type=_number,
+        default=10.0,
+        help="seconds until a lost connection frees its seat [default: 10]",
     )
     console.add_argument(
         "--wait", metavar="N", type=_integer, default=1, help="people to wait for before the first timestep [default: 1]"
     )
     fills = ("simulated", "empty")
     console.add_argument(
-        "--fill", choices=fills, default="simulated", help="who plays seats that no person takes [default: simulated]"
+        "--fill", choices=fills, default="simulated", help="who plays the seats that nobody takes [default: simulated]"
     )
     console.add_argument("--seed", metavar="N", type=_seed, help="random seed [default: 0]")
     console.add_argument("--output", metavar="DIR", type=Path, help="run folder [default: a new one below runs/]")
@@ -196,7 +196,7 @@ def _add_console(commands: Any, environment: str | None) -> None:
 def _add_parameters(command: Any, environment: str | None, short: Mapping[str, str] = MappingProxyType({})) -> None:
     """Add a flag for each field of `Config`, with a short form for some, and for each parameter of an algorithm."""
     fields = command.add_argument_group(f"parameters{f' (defaults of {environment})' if environment else ''}")
-    own = command.add_argument_group("parameters of one algorithm, refused with another")
+    own = command.add_argument_group("parameters of one algorithm each")
     for name, field in every_field().items():
         if name in FIELDS and name != "environment":
             _add_field(fields, name, field, environment, *([short[name]] if name in short else []))

@@ -1,15 +1,13 @@
 """The folder of a run: configuration, per-timestep metrics, figure and trained policy.
 
-`config.json` is written when a run begins, and again last of all with the SHA-256 of the data files, and always with
-that of its own content. What does not match is refused. Nothing is executed when it is read.
+`config.json` is written when a run starts, and again at the end, with the SHA-256 digests of the data files. It always holds
+the digest of its own content. What does not match is refused. Nothing that is read is executed.
 """
 
 import contextlib
 import csv
-import io
 import itertools
 import json
-import math
 import os
 import re
 import time
@@ -24,20 +22,19 @@ from flax import serialization
 
 from fleetjax import envs
 from fleetjax.checks import state_shapes
-from fleetjax.config import Config, all_fields, get_value, validate
-from fleetjax.io import checkpoint, files, interventions
+from fleetjax.config import Config
+from fleetjax.io import checkpoint, files, interventions, metrics_csv, plain
+from fleetjax.io.files import expect
 from fleetjax.learning.imitation import PolicyState
 from fleetjax.metrics import Metrics
 from fleetjax.priority import get_algorithm
 from fleetjax.version import VERSION
 
-CONFIG, METRICS, FIGURE, POLICY, EVALUATION = "config.json", "metrics.csv", "figure.png", "policy.msgpack", "evaluation.json"
+CONFIG, FIGURE, POLICY, EVALUATION = "config.json", "figure.png", "policy.msgpack", "evaluation.json"
+METRICS = metrics_csv.FILE
 RECORD = "console.bin"  # what people did, where they supervised the run
 DATA = (METRICS, POLICY, interventions.FILE, RECORD)
-REALS = ("reward", "uncertainty", "policy_loss")  # the metrics that are no counts
-_COLUMNS = ("timestep", *Metrics._fields)
 _OWN_DIGEST = "sha256_config"
-_LARGEST = 2**31 - 1  # traced integers are i32
 
 
 class Run(NamedTuple):
@@ -49,7 +46,7 @@ class Run(NamedTuple):
         seed: the seed of its key.
         logged: whether interventions are logged.
         digests: SHA-256 by file name.
-        versions: what it ran under, in order, each with the `timestep` from which on; nothing before it begins.
+        versions: what it ran under, in order, each with the `timestep` at which it began; empty before the run starts.
     """
 
     folder: Path
@@ -68,32 +65,8 @@ def default_folder(config: Config, seed: int) -> Path:
     return next(p for p in itertools.chain([path], others) if not p.exists())
 
 
-def check_free(path: Path, *, overwrite: bool, is_folder: bool = False) -> Path:
-    """Check that an output can be written without loss, before it is computed.
-
-    Args:
-        path: where it shall go.
-        overwrite: whether it may replace what is there.
-        is_folder: whether it is a folder; else it is a file.
-
-    Returns:
-        Path: where to write it: in place of a link, its target.
-
-    Raises:
-        FileExistsError: if something is there, and it is no empty folder, unless `overwrite`.
-        OSError: if it cannot be written there.
-    """
-    if os.path.lexists(path) and not overwrite and not (is_folder and path.is_dir() and not any(path.iterdir())):
-        raise FileExistsError(f"{path} exists already; pass --overwrite to replace it")
-    if path.exists() and path.is_dir() != is_folder:
-        raise FileExistsError(f"{path} is a {'file' if path.is_file() else 'folder'}; choose another --output")
-    target = Path(os.path.realpath(path))
-    files.check_place(target)
-    return target
-
-
 def is_run(path: Path) -> bool:
-    """Return whether a folder holds a run, be it damaged."""
+    """Return whether a folder holds a run, even a damaged one."""
     return (path / CONFIG).exists()
 
 
@@ -112,7 +85,7 @@ def check_folder(path: Path, *, overwrite: bool) -> None:
 
 
 def prepare(run: Run) -> bool:
-    """Write the configuration of a new run, unless the folder holds a run: that one stays until `create`.
+    """Write the configuration of a new run, unless the folder holds a run, which stays until `create`.
 
     Returns:
         bool: whether the folder held no run.
@@ -124,9 +97,9 @@ def prepare(run: Run) -> bool:
 
 
 def create(run: Run) -> None:
-    """Write the configuration of a new run; an older run in the folder goes."""
+    """Write the configuration of a new run; an older run in the folder is deleted."""
     checkpoint.clear(run.folder)
-    write_config(run, sealed=False)  # before data go: if killed in between, this run can be resumed, from the start
+    write_config(run, sealed=False)  # first: if killed in between, this run can be resumed, at t = 0
     for name in (FIGURE, EVALUATION, *DATA):
         (run.folder / name).unlink(missing_ok=True)
 
@@ -147,7 +120,7 @@ def versions() -> dict[str, str]:
 
 
 def resumed(run: Run, timestep: int) -> Run:
-    """Return a run as it resumes at a timestep: with today's versions from there on, if they are not those before."""
+    """Return a run as it resumes at a timestep: with today's versions from there on, if they differ from those before."""
     before = [entry for entry in run.versions if entry["timestep"] < timestep]
     now = {"timestep": timestep, **versions()}
     return run._replace(versions=(*before, *([now] if changes(before[-1], now) else [])))
@@ -173,45 +146,18 @@ def with_digest(content: Mapping[str, Any]) -> dict[str, Any]:
     return rest | {_OWN_DIGEST: files.digest(json.dumps(rest, sort_keys=True).encode())}
 
 
-def to_plain(config: Config) -> dict[str, Any]:
-    """Return fields and parameters as plain Python values; the shortest decimal that stands for each f32."""
-
-    def plain(value: Any, kind: type) -> Any:
-        if kind is tuple:
-            return list(value)
-        return float(str(np.float32(value))) if kind is float else kind(value)
-
-    return {name: plain(get_value(config, name), field.kind) for name, field in all_fields(config.algorithm).items()}
-
-
 def identity(config: Config, seed: int) -> dict[str, Any]:
     """Return plain values that tell a run from others."""
-    return {"config": to_plain(config), "seed": seed}
+    return {"config": plain.to_plain(config), "seed": seed}
 
 
-def open_metrics(folder: Path, mark: Mapping[str, Any] | None = None) -> files.Log:
-    """Begin `metrics.csv`, a row a timestep with first column `timestep`, or cut it back to a mark."""
-    log = files.Log(folder / METRICS, mark)
-    if not mark:
-        log.append((",".join(_COLUMNS) + "\n").encode())
-    return log
-
-
-def append_metrics(log: files.Log, metrics: Metrics, first: int) -> None:
-    """Append the rows of the timesteps from `first` on."""
-    rows = io.StringIO(newline="")
-    columns = [np.asarray(x) for x in metrics]
-    csv.writer(rows, lineterminator="\n").writerows((t, *row) for t, row in enumerate(zip(*columns, strict=True), first))
-    log.append(rows.getvalue().encode())
-
-
-def write_policy(folder: Path, learner: PolicyState) -> None:
+def write_policy(folder: Path, policy: PolicyState) -> None:
     """Write `policy.msgpack`: the ensemble's parameters [E, ...] and the normalizer, by flax's serialization."""
-    files.write(folder / POLICY, serialization.to_bytes(_policy(learner)))
+    files.write(folder / POLICY, serialization.to_bytes(_stored(policy)))
 
 
-def _policy(learner: PolicyState) -> dict[str, Any]:
-    return {"params": learner.params, "normalizer": learner.normalizer}
+def _stored(policy: PolicyState) -> dict[str, Any]:
+    return {"params": policy.params, "normalizer": policy.normalizer}
 
 
 @contextlib.contextmanager
@@ -220,9 +166,9 @@ def _blame(path: Path) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError:
-        raise ValueError(f"{path} is missing: not the folder of a finished run") from None
+        raise ValueError(f"{path} is missing, so this is not the folder of a finished run") from None
     except RecursionError:
-        raise ValueError(f"{path} is damaged: nested too deeply") from None
+        raise ValueError(f"{path} is damaged: it is nested too deeply") from None
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError, csv.Error) as error:
         raise ValueError(f"{path} cannot be used: {error}") from None
 
@@ -234,28 +180,29 @@ def read_run(folder: Path) -> Run:
         ValueError: if it is damaged, or not a run folder of this version; the message has the file and the reason.
     """
     if not folder.is_dir():
-        raise ValueError(f"{folder} is not a run folder: {'it is a file' if folder.exists() else 'there is none'}")
+        raise ValueError(f"{folder} is not a run folder: {'it is a file' if folder.exists() else 'it does not exist'}")
     with _blame(folder / CONFIG):
         content = json.loads((folder / CONFIG).read_bytes())
-        _expect(isinstance(content, dict) and isinstance(content.get("config"), dict), "it is not fleetjax's")
-        _expect(_OWN_DIGEST in content, "it has no SHA-256 of its own (another version of fleetjax?)")
-        _expect(
-            content[_OWN_DIGEST] == with_digest(content)[_OWN_DIGEST], "it was edited or is damaged; its SHA-256 is another"
+        expect(isinstance(content, dict) and isinstance(content.get("config"), dict), "it was not written by fleetjax")
+        expect(_OWN_DIGEST in content, "it has no SHA-256 digest of its own (another version of fleetjax?)")
+        expect(
+            content[_OWN_DIGEST] == with_digest(content)[_OWN_DIGEST],
+            "it was edited or is damaged: its SHA-256 digest does not match",
         )
         seed, digests = content.get("seed"), content.get("sha256")
         if not isinstance(seed, int) or not 0 <= seed < 2**32:
             raise ValueError(f"seed = {seed!r} must be a whole number")
         if not isinstance(digests, dict) or not digests.keys() <= set(DATA):
-            raise ValueError("the SHA-256 of the data files are missing, or are those of others")
+            raise ValueError("the SHA-256 digests of the data files are missing, or name other files")
         logged, ran_under = content.get("log_interventions") is True, _versions_from(content.get("versions"))
-        return Run(folder, _from_plain(content["config"]), seed, logged, digests, ran_under)
+        return Run(folder, plain.from_plain(content["config"]), seed, logged, digests, ran_under)
 
 
 def read_finished(run: Run) -> Metrics | None:
-    """Read the metrics of a run that has all its timesteps; None if it has not.
+    """Read the metrics of a finished run; None if timesteps are missing.
 
     Raises:
-        ValueError: if anything that such a run leaves is missing or damaged.
+        ValueError: if one of its files is missing or damaged.
     """
     if METRICS not in run.digests:
         return None
@@ -271,21 +218,8 @@ def read_finished(run: Run) -> Metrics | None:
         if run.logged:
             read_interventions(run)
     except ValueError as error:
-        raise ValueError(f"{error}; repeat the run with --overwrite") from None
+        raise ValueError(f"{error}; start it again with --overwrite") from None
     return metrics
-
-
-def _from_plain(fields: Mapping[str, Any]) -> Config:
-    known = all_fields(fields.get("algorithm", ""))
-    for problem, names in (("unknown", set(fields) - set(known)), ("missing", set(known) - set(fields))):
-        _expect(not names, f"{problem} fields: {', '.join(sorted(names))} (another version of fleetjax?)")
-    for name, value in fields.items():
-        _expect(_fits(value, known[name].kind), f"{name} = {value!r} must be of type {known[name].kind.__name__}")
-    config = Config().replace(**{**fields, "human_capacity": 0})
-    if fields["human_capacity"] not in (0, config.human_capacity):  # it was asked for, and does not follow from the others
-        config = config.replace(human_capacity=fields["human_capacity"])
-    validate(config)
-    return config
 
 
 def _versions_from(entries: Any) -> tuple[Mapping[str, Any], ...]:
@@ -296,37 +230,20 @@ def _versions_from(entries: Any) -> tuple[Mapping[str, Any], ...]:
     """
     kinds = {"timestep": int, **dict.fromkeys(versions(), str)}
     sound = isinstance(entries, list) and all(isinstance(entry, dict) and entry.keys() == kinds.keys() for entry in entries)
-    if sound and all(_fits(entry[name], kind) for entry in entries for name, kind in kinds.items()):
+    if sound and all(plain.fits(entry[name], kind) for entry in entries for name, kind in kinds.items()):
         timesteps = [entry["timestep"] for entry in entries]
         if timesteps[:1] == [0] and timesteps == sorted(set(timesteps)):
             return tuple(entries)
-    raise ValueError("its versions are not a list of those that it ran under, from t = 0 on")
-
-
-def _expect(holds: bool, otherwise: str) -> None:
-    if not holds:
-        raise ValueError(otherwise)
-
-
-def _is_int(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and abs(value) <= _LARGEST
-
-
-def _fits(value: Any, kind: type) -> bool:
-    if kind is tuple:
-        return isinstance(value, list) and all(map(_is_int, value))
-    if kind is float:
-        return _is_int(value) or (isinstance(value, float) and math.isfinite(value))
-    return _is_int(value) if kind is int else isinstance(value, kind)
+    raise ValueError("its versions are not a list of entries in order from t = 0")
 
 
 def _read_data(run: Run, name: str) -> bytes:
-    """Return the content of a data file that is as it was written."""
+    """Return the content of a data file, checked against its digest."""
     data = (run.folder / name).read_bytes()
     if METRICS in run.digests:
-        _expect(name in run.digests, "its SHA-256 is not in config.json, so it may be another run's")
-    _expect(name in run.digests, f"the run is not finished; go on with it: fleetjax run --resume {run.folder}")
-    _expect(run.digests.get(name) == files.digest(data), "its SHA-256 is not that in config.json, so it is damaged")
+        expect(name in run.digests, "its SHA-256 digest is not in config.json, so it may belong to another run")
+    expect(name in run.digests, f"the run is not finished; resume it with: fleetjax run --resume {run.folder}")
+    expect(run.digests.get(name) == files.digest(data), "its SHA-256 digest does not match config.json, so it is damaged")
     return data
 
 
@@ -337,22 +254,7 @@ def read_metrics(run: Run) -> Metrics:
         ValueError: if the file is missing, damaged or not a run's.
     """
     with _blame(run.folder / METRICS):
-        return parse_metrics(_read_data(run, METRICS), run.config.num_steps)
-
-
-def parse_metrics(data: bytes, num_steps: int) -> Metrics:
-    """Return the Metrics[T] in the content of `metrics.csv`, as numpy arrays.
-
-    Raises:
-        ValueError: if it is not a run's of at most `num_steps` timesteps.
-    """
-    _expect(bool(data), "it is empty")
-    head, *rows = csv.reader(io.StringIO(data.decode()))
-    _expect(head == list(_COLUMNS), "its columns are not those of this version of fleetjax")
-    _expect(0 < len(rows) <= num_steps, f"{len(rows)} rows for {num_steps} timesteps")
-    _expect(all(row[:1] == [str(t)] for t, row in enumerate(rows)), "timesteps are missing")
-    columns = zip(Metrics._fields, list(zip(*rows, strict=True))[1:], strict=True)
-    return Metrics._make(np.array(x, np.float32 if name in REALS else np.int32) for name, x in columns)
+        return metrics_csv.parse(_read_data(run, METRICS), run.config.num_steps)
 
 
 def read_interventions(run: Run) -> list[np.ndarray]:
@@ -362,7 +264,7 @@ def read_interventions(run: Run) -> list[np.ndarray]:
         ValueError: if they were not logged, or the file is missing or damaged.
     """
     if not run.logged:
-        raise ValueError(f"{run.folder} has no log of interventions; run with --log-interventions")
+        raise ValueError(f"{run.folder} has no log of interventions; repeat the run with --log-interventions")
     with _blame(run.folder / interventions.FILE):
         spec = envs.make(run.config.environment, run.config.backend).spec
         return interventions.split(interventions.parse(_read_data(run, interventions.FILE), spec))
@@ -375,12 +277,12 @@ def read_policy(run: Run) -> PolicyState:
         ValueError: if the file is missing, damaged or does not fit the configuration.
     """
     with _blame(run.folder / POLICY):
-        shapes = state_shapes(run.config, envs.make(run.config.environment, run.config.backend)).learner
+        shapes = state_shapes(run.config, envs.make(run.config.environment, run.config.backend)).policy
         template = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
-        stored = serialization.from_bytes(_policy(template), _read_data(run, POLICY))
-        wanted, found = jax.tree.leaves(_policy(template)), jax.tree.leaves(stored)
+        stored = serialization.from_bytes(_stored(template), _read_data(run, POLICY))
+        wanted, found = jax.tree.leaves(_stored(template)), jax.tree.leaves(stored)
         pairs = zip(wanted, found, strict=True)
         same = all(isinstance(b, np.ndarray) and (a.shape, a.dtype) == (b.shape, b.dtype) for a, b in pairs)
-        _expect(same, "its arrays do not have the shapes that config.json asks for")
-        _expect(all(np.all(np.isfinite(x)) for x in found), "it holds numbers that are not finite")
+        expect(same, "its arrays do not have the shapes that follow from config.json")
+        expect(all(np.all(np.isfinite(x)) for x in found), "it holds numbers that are not finite")
         return jax.tree.map(jnp.asarray, template._replace(**stored))

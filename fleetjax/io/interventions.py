@@ -1,4 +1,4 @@
-"""The log of interventions: a record for each timestep that a human teleoperates a robot, appended as the run goes on."""
+"""The log of interventions: a record for each timestep in which a human teleoperates a robot, appended to during the run."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -28,7 +28,7 @@ def record(spec: EnvSpec) -> np.dtype:
 
 
 def open_log(folder: Path, mark: Mapping[str, Any] | None = None) -> files.Log:
-    """Begin the log of a run, or cut it back to a mark."""
+    """Start the log of a run, or cut it back to a mark."""
     return files.Log(folder / FILE, mark)
 
 
@@ -51,7 +51,7 @@ def parse(data: bytes, spec: EnvSpec) -> np.ndarray:
     """
     kind = record(spec)
     if len(data) % kind.itemsize:
-        raise ValueError(f"{len(data)} bytes are no whole number of records of {kind.itemsize}")
+        raise ValueError(f"{len(data)} bytes is not a multiple of {kind.itemsize}, the size of a record")
     return np.frombuffer(data, kind)
 
 
@@ -62,6 +62,6 @@ def split(records: np.ndarray) -> list[np.ndarray]:
     """
     ordered = records[np.lexsort((records["timestep"], records["robot"], records["human"]))]
     same = (ordered[name][1:] == ordered[name][:-1] for name in ("human", "robot", "episode"))
-    goes_on = np.logical_and.reduce([*same, np.diff(ordered["timestep"]) == 1])
-    parts = np.split(ordered, np.flatnonzero(~goes_on) + 1) if ordered.size else []
+    continues = np.logical_and.reduce([*same, np.diff(ordered["timestep"]) == 1])
+    parts = np.split(ordered, np.flatnonzero(~continues) + 1) if ordered.size else []
     return sorted(parts, key=lambda part: (part["timestep"][0], part["human"][0]))

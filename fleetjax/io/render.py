@@ -16,9 +16,10 @@ import numpy as np
 from fleetjax import envs
 from fleetjax.allocation import helper_of
 from fleetjax.config import Config
+from fleetjax.experiment import evaluate, prepare, run, without_teleoperation
 from fleetjax.fleet import FleetState, make_fleet
+from fleetjax.keys import key_at
 from fleetjax.learning.imitation import PolicyState
-from fleetjax.run import evaluate, prepare, run, without_teleoperation
 from fleetjax.types import EnvState
 
 FORMATS = (".gif", ".mp4")
@@ -69,17 +70,17 @@ def check(config: Config) -> None:
         check_gl()
 
 
-def start(config: Config, key: jax.Array, learner: PolicyState | None, *, skip: int) -> tuple[Config, FleetState]:
-    """Return the state in which a film begins, and the configuration to go on with.
+def start(config: Config, key: jax.Array, policy: PolicyState | None, *, skip: int) -> tuple[Config, FleetState]:
+    """Return the configuration of a film, and the state in which it begins.
 
     Args:
         config: configuration.
         key: random key.
-        learner: a trained policy that acts alone; None pre-trains, and humans help.
+        policy: a trained policy that acts alone; None pre-trains, and humans help.
         skip: timesteps to run first.
     """
-    if learner is not None:
-        state = jax.jit(evaluate)(config.replace(num_steps=max(1, skip)), key, learner).state
+    if policy is not None:
+        state = jax.jit(evaluate)(config.replace(num_steps=max(1, skip)), key, policy).state
         return without_teleoperation(config), state
     state = jax.jit(prepare)(config, key)
     return config, jax.jit(run)(config.replace(num_steps=skip), key, state).state if skip else state
@@ -91,10 +92,9 @@ def shoot(config: Config, key: jax.Array, state: FleetState, *, num_shown: int) 
     draw = env.picture
     look: Callable[[EnvState], Any] = env.scene.pose if env.scene else lambda state: (draw(state),) if draw else ()
     fleet = make_fleet(config, env)
-    _, key_steps = jax.random.split(key)
 
     def timestep(state: FleetState, _: None):
-        after, _metrics = fleet.step(state, jax.random.fold_in(key_steps, state.timestep))
+        after, _metrics = fleet.step(state, key_at(key, state.timestep))
         helped = helper_of(after.humans, config.num_robots) >= 0
         seen = jax.tree.map(lambda x: x[:num_shown], (state.env, helped & ~after.resetting))
         return after, Film(jax.vmap(look)(seen[0]), seen[0].violation, seen[1])

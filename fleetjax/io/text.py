@@ -10,21 +10,24 @@ from fleetjax.priority import get_algorithm
 
 # What the paper calls an algorithm, and what it does.
 _KNOWN = {
-    "constraint": ("Constraint", "the first clone, never updated; humans only reset robots in violation (the paper's BC)"),
+    "constraint": (
+        "Constraint",
+        "the policy cloned at the start; humans only reset robots in violation (the paper's BC)",
+    ),
     "constraint_trained": (
         "Constraint, trained out",
-        "the same, with as many gradient steps before the start as others take in all",
+        "the same, with as many gradient steps before the start as the others take in total",
     ),
-    "random": ("Random", "random robots get help, as much as random_threshold lets through"),
-    "ensemble_dagger": ("Fleet-EnsembleDAgger", "U.C.: uncertain robots first, then robots in violation"),
+    "random": ("Random", "robots get help at random, if their random score reaches random_threshold"),
+    "ensemble_dagger": ("Fleet-EnsembleDAgger", "uncertain robots first, then robots in violation"),
     "thrifty_dagger": (
         "Fleet-ThriftyDAgger",
-        "U.G.C.: robots uncertain or unlikely to reach their goal first, then in violation",
+        "robots that are uncertain or unlikely to reach their goal first, then robots in violation",
     ),
     "expert": ("Expert", "every robot is teleoperated and nothing is learnt: the upper bound"),
     "cur": ("C.U.R.", "robots in violation first, then by uncertainty, then by risk: the paper's proposal"),
 }
-ORDERS = "any order of distinct letters out of c (violation), u (uncertainty) and r (risk), such as uc: the first comes first"
+ORDERS = "any order of distinct letters from c (violation), u (uncertainty) and r (risk); uc: first uncertainty, then violation"
 
 
 def is_order(algorithm: str) -> bool:
@@ -61,7 +64,7 @@ def count(number: float) -> str:
 
 
 def plural(number: int, thing: str) -> str:
-    """Return how many there are of a thing.
+    """Return a number with the name of what is counted.
 
     >>> plural(1, "seed"), plural(3, "seed")
     ('1 seed', '3 seeds')
@@ -152,6 +155,6 @@ def run_table(metrics: Metrics, config: Config) -> str:
 def evaluation_table(metrics: Metrics, config: Config) -> str:
     """Return the row of the paper's table of trained policies, with its head."""
     total = add_up(metrics)
-    head = ("policy", "successes", "hard resets", "idle time")
+    head = ("policy", "successes", "violations", "idle time")
     row = (label(config.algorithm), count(total["successes"]), count(total["violations"]), count(total["idle"]))
     return table([head, row], right=[1, 2, 3])

@@ -57,6 +57,6 @@ def append(buffer: Buffer, rows: Any, mask: jax.Array, *, overwrite: bool) -> Bu
 
 
 def draw_index(key: jax.Array, shape: tuple[int, ...], size: jax.Array) -> jax.Array:
-    """Return i32[*shape] row numbers below `size` i32[], uniform (to 1 part in 2^32 / size); 0 where `size` is 0."""
+    """Return i32[*shape] row numbers below `size` i32[...], uniform (to 1 part in 2^32 / size); 0 where `size` is 0."""
     bits = jax.random.bits(key, shape)
     return (bits % jnp.maximum(size, 1).astype(jnp.uint32)).astype(jnp.int32)

@@ -109,15 +109,12 @@ def make_critic(kind: str, config: Config, spec: EnvSpec, learner: Learner) -> C
 
     def sample(state: CriticState, key: jax.Array) -> tuple[Transition, jax.Array]:
         """A batch with `positive_fraction` positives as far as there are any, and bool[B] whether a row holds data."""
-        key_positive, key_negative = jax.random.split(key)
-
-        def draw(key: jax.Array, store: buffer.Buffer) -> Transition:
-            return take(store.rows, buffer.draw_index(key, (config.batch_size,), store.size))
-
+        sizes = jnp.stack([state.positives.size, state.negatives.size])
+        index = buffer.draw_index(key, (2, config.batch_size), sizes[:, None])
         wanted = jnp.arange(config.batch_size) < jnp.round(config.positive_fraction * config.batch_size).astype(jnp.int32)
         positive = (wanted & (state.positives.size > 0)) | (state.negatives.size == 0)
-        batch = where(positive, draw(key_positive, state.positives), draw(key_negative, state.negatives))
-        return batch, jnp.where(positive, state.positives.size, state.negatives.size) > 0
+        batch = where(positive, take(state.positives.rows, index[0]), take(state.negatives.rows, index[1]))
+        return batch, jnp.where(positive, *sizes) > 0
 
     def update(state: CriticState, policy: PolicyState, key: jax.Array) -> CriticState:
         batch, valid = sample(state, key)

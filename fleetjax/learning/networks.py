@@ -1,5 +1,6 @@
 """The networks of policy and critics, and how they see observations."""
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -7,6 +8,7 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from fleetjax.envs import EnvSpec
@@ -17,6 +19,8 @@ CLIP = 10.0  # deviations at which normalised observations are clipped
 # Adam without its learning rate, which is a traced field of the configuration. `eps_root` keeps derivatives through an update
 # finite where a gradient is exactly 0, as behind a dead ReLU.
 ADAM = optax.scale_by_adam(eps_root=1e-16)
+_TRUNCATED_DEVIATION = 0.87962566103423978  # of a standard normal cut off at -2 and 2
+_Dense = functools.partial(nn.Dense, kernel_init=nn.initializers.zeros)  # see `_draw_kernels`
 
 
 class Network(NamedTuple):
@@ -30,9 +34,26 @@ def make_mlp(hidden_sizes: Sequence[int], output_size: int, *, first: Sequence[A
     """Return dense layers with ReLU between them, behind those that come `first`; the last is linear."""
     layers = [*first]
     for size in hidden_sizes:
-        layers += [nn.Dense(size), nn.relu]
-    module = nn.Sequential([*layers, nn.Dense(output_size)])
-    return Network(module.init, lambda params, x: jnp.asarray(module.apply(params, x)))
+        layers += [_Dense(size), nn.relu]
+    module = nn.Sequential([*layers, _Dense(output_size)])
+
+    def init(key: jax.Array, example: jax.Array) -> Any:
+        return _draw_kernels(module.init(key, example), key)
+
+    return Network(init, lambda params, x: jnp.asarray(module.apply(params, x)))
+
+
+def _draw_kernels(params: Any, key: jax.Array) -> Any:
+    """Return parameters with all kernels [I, O] drawn at once, as flax's `lecun_normal` does one by one.
+
+    A draw takes long to compile.
+    """
+    leaves, structure = jax.tree.flatten(params)
+    sizes = [x.size if x.ndim == 2 else 0 for x in leaves]
+    draw = jax.random.truncated_normal(key, -2.0, 2.0, (sum(sizes),)) / _TRUNCATED_DEVIATION
+    parts = jnp.split(draw, np.cumsum(sizes)[:-1])
+    drawn = [part.reshape(x.shape) / math.sqrt(x.shape[0]) if x.ndim == 2 else x for x, part in zip(leaves, parts, strict=True)]
+    return jax.tree.unflatten(structure, drawn)
 
 
 class _Convolutions(nn.Module):
@@ -57,7 +78,7 @@ class _Convolutions(nn.Module):
             height, width, depth = image.shape[-3:]
             patches = image.reshape(*lead, height // side, side, width // side, side, depth)
             patches = jnp.moveaxis(patches, -4, -3).reshape(*lead, height // side, width // side, side * side * depth)
-            image = nn.relu(nn.Dense(channels)(patches))
+            image = nn.relu(_Dense(channels)(patches))
         height, width, channels = image.shape[-3:]
         sharpness = self.param("sharpness", nn.initializers.ones, (channels,))
         weight = jax.nn.softmax((sharpness * image).reshape(*lead, height * width, channels), axis=-2)

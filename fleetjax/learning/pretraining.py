@@ -30,25 +30,24 @@ def collect_demonstrations(
         key: random key.
     """
 
-    def step(carry: tuple[EnvState, jax.Array], key: jax.Array):
+    def step(carry: tuple[EnvState, jax.Array], keys: jax.Array):
         state, running = carry
-        key_act, key_env, key_goal = jax.random.split(key, 3)
-        action = jax.vmap(supervisor.act)(state, jax.random.split(key_act, LANES))
+        action = jax.vmap(supervisor.act)(state, keys[0])
         pair = imitation.Pair(state.obs, action)
-        after = jax.vmap(env.step)(state, action, running, jax.random.split(key_env, LANES))
+        after = jax.vmap(env.step)(state, action, running, keys[1])
         ended = after.violation | after.timeout | (after.success & (env.next_goal is None))
         if env.next_goal:
-            renewed = jax.vmap(env.next_goal)(after, jax.random.split(key_goal, LANES))
+            renewed = jax.vmap(env.next_goal)(after, keys[2])
             after = where(after.success, renewed, after)
         return (where(running, after, state), running & ~ended), (pair, running)
 
     def episodes(carry: tuple[imitation.HumanData, jax.Array]):
         data, count = carry
-        key_reset, key_steps, key_data = jax.random.split(jax.random.fold_in(key, count), 3)
         robots = (count * LANES + jnp.arange(LANES)) % config.num_robots
-        start = jax.vmap(env.reset)(jax.random.split(key_reset, LANES), robots)
-        keys = jax.random.split(key_steps, env.spec.horizon)
-        _, (pairs, valid) = jax.lax.scan(step, (start, jnp.ones(LANES, bool)), keys)
+        keys = jax.random.split(jax.random.fold_in(key, count), 1 + LANES * (1 + 3 * env.spec.horizon))
+        key_data, keys_reset, keys_steps = keys[0], keys[1 : 1 + LANES], keys[1 + LANES :]
+        start = jax.vmap(env.reset)(keys_reset, robots)
+        _, (pairs, valid) = jax.lax.scan(step, (start, jnp.ones(LANES, bool)), keys_steps.reshape(-1, 3, LANES))
         # Episode after episode, each in order of time.
         pairs, valid = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]), (pairs, valid))
         valid &= data.pairs.added // config.augmented_copies + jnp.cumsum(valid) <= wanted
@@ -77,28 +76,30 @@ def collect_transitions(config: Config, env: Env, act, add, store: critic.Critic
     """
     num_lanes = min(config.num_robots, MOST_LANES)
     lanes = jnp.arange(num_lanes)
-    key_start, key_bursts = jax.random.split(key)
 
-    def step(carry, key):
-        state, store, count, robots = carry
-        key_act, key_noise, key_env, key_reset = jax.random.split(key, 4)
+    def step(carry, keys):
+        state, ended, store, count, robots = carry
+        (key_act, key_noise), keys_env, keys_reset = keys[:2], keys[2 : 2 + num_lanes], keys[2 + num_lanes :]
+        state = where(ended, jax.vmap(env.reset)(keys_reset, robots), state)
         action = disturb(config, env, act(state, key_act), key_noise)
-        after = jax.vmap(env.step)(state, action, jnp.ones(num_lanes, bool), jax.random.split(key_env, num_lanes))
+        after = jax.vmap(env.step)(state, action, jnp.ones(num_lanes, bool), keys_env)
         transition = critic.Transition(state.obs, action, after.obs, after.violation, after.success)
         wanted = count + lanes < config.num_critic_transitions
         store = add(store, transition, wanted)
         ended = after.violation | after.timeout | after.success
         robots = jnp.where(ended, (robots + num_lanes) % config.num_robots, robots)
-        fresh = jax.vmap(env.reset)(jax.random.split(key_reset, num_lanes), robots)
-        return (where(ended, fresh, after), store, count + num_lanes, robots), None
+        return (after, ended, store, count + num_lanes, robots), None
 
     def burst(carry):
-        keys = jax.random.split(jax.random.fold_in(key_bursts, carry[2]), BURST)
+        keys = jax.random.split(jax.random.fold_in(key, carry[3]), (BURST, 2 * (1 + num_lanes)))
         return jax.lax.scan(step, carry, keys)[0]
 
-    start = jax.vmap(env.reset)(jax.random.split(key_start, num_lanes), lanes)
-    unfinished = lambda carry: carry[2] < config.num_critic_transitions  # noqa: E731
-    return jax.lax.while_loop(unfinished, burst, (start, store, jnp.int32(0), lanes))[1]
+    nobody = jax.tree.map(
+        lambda x: jax.lax.full_like(x, 0, shape=(num_lanes, *x.shape)), jax.eval_shape(env.reset, key, jnp.int32(0))
+    )
+    start = (nobody, jnp.ones(num_lanes, bool), store, jnp.int32(0), lanes)
+    unfinished = lambda carry: carry[3] < config.num_critic_transitions  # noqa: E731
+    return jax.lax.while_loop(unfinished, burst, start)[2]
 
 
 def disturb(config: Config, env: Env, action: jax.Array, key: jax.Array) -> jax.Array:

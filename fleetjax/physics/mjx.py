@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from fleetjax.physics.base import PhysicsState, contain_divergence
+from fleetjax.physics.contract import PhysicsState, contain_divergence
 
 with contextlib.redirect_stdout(io.StringIO()):  # where warp is missing, MJX prints so
     from mujoco import mjx

@@ -1,6 +1,6 @@
 """MuJoCo's C engine behind the physics contract: a thread pool, reached from JAX by a callback.
 
-The whole batch of robots crosses to the host once a control step. Robots that stand still are left out, and
+The whole batch of robots crosses to the host once a control step. Robots that stand still are skipped, and
 a diverged robot (MuJoCo resets it or stops it early) is recognised by its clock.
 """
 
@@ -12,9 +12,10 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from mujoco import rollout
 
-from fleetjax.physics.base import PhysicsState, contain_divergence
+from fleetjax.physics.contract import PhysicsState, contain_divergence
 
 
 def num_threads() -> int:
@@ -34,25 +35,28 @@ class _Simulator:
         self.pool = rollout.Rollout(nthread=threads)
         self.lock = threading.Lock()  # the pool serves one batch at a time
 
-    def __call__(self, qpos, qvel, act, warmstart, sensors, time, control, active):
-        """Step the active robots of a batch with any leading axes; return the new values and who failed."""
-        batch = np.shape(active)
-        active = np.asarray(active).reshape(-1)
-        rows = np.flatnonzero(active)
-        flat = [np.array(x, np.float32).reshape(active.size, -1) for x in (qpos, qvel, act, warmstart, sensors, time)]
-        failed = np.zeros(active.size, bool)
-        if rows.size:
-            control = np.asarray(control, np.float64).reshape(active.size, -1)[rows]
-            before = np.concatenate([flat[5][rows], flat[0][rows], flat[1][rows], flat[2][rows]], axis=1, dtype=np.float64)
-            results, failed[rows] = self._step(before, control, flat[3][rows].astype(np.float64))
-            for values, result in zip(flat, results, strict=True):
-                values[rows] = result
-        return tuple(x.reshape(np.shape(y)) for x, y in zip(flat, (qpos, qvel, act, warmstart, sensors, time), strict=True)), (
-            failed.reshape(batch)
-        )
+    def __call__(self, packed):
+        """Step the active robots of a batch with any leading axes.
 
-    def _step(self, before, control, warmstart):
-        nq, nv, dt = self.model.nq, self.model.nv, self.model.opt.timestep
+        Args:
+            packed: f32[..., K], of each robot its state without `diverged`, then its control, then whether it is active.
+
+        Returns:
+            f32[..., K']: its state, then whether it failed.
+        """
+        flat = np.asarray(packed).reshape(-1, packed.shape[-1])
+        rows = np.flatnonzero(flat[:, -1])
+        after = np.concatenate([flat[:, : -1 - self.model.nu], np.zeros((len(flat), 1), np.float32)], axis=1)
+        if rows.size:
+            after[rows] = self._step(flat[rows].astype(np.float64))
+        return after.reshape(*packed.shape[:-1], -1)
+
+    def _step(self, robots):
+        model, dt = self.model, self.model.opt.timestep
+        nq, nv, na = model.nq, model.nv, model.na
+        parts = np.cumsum([nq, nv, na, nv, model.nsensordata, 1, model.nu])
+        qpos, qvel, act, warmstart, _, time, control, _ = np.split(robots, parts, axis=1)
+        before = np.concatenate([time, qpos, qvel, act], axis=1)
         with self.lock:
             states, sensors = self.pool.rollout(
                 self.model,
@@ -66,14 +70,7 @@ class _Simulator:
         velocity = slice(1 + nq, 1 + nq + nv)
         acceleration = (after[:, velocity] - previous[:, velocity]) / dt  # damping is explicit: exactly the solver's
         failed = np.abs(after[:, 0] - before[:, 0] - self.substeps * dt) > dt / 2
-        return (
-            after[:, 1 : 1 + nq],
-            after[:, velocity],
-            after[:, 1 + nq + nv :],
-            acceleration,
-            sensors[:, -1],
-            after[:, :1],
-        ), failed
+        return np.concatenate([after[:, 1:], acceleration, sensors[:, -1], after[:, :1], failed[:, None]], axis=1)
 
 
 def make_step(model: mujoco.MjModel, substeps: int) -> Callable[[PhysicsState, jax.Array, jax.Array], PhysicsState]:
@@ -90,12 +87,13 @@ def make_step(model: mujoco.MjModel, substeps: int) -> Callable[[PhysicsState, j
     simulator = _Simulator(model, substeps)
 
     def step(state: PhysicsState, control: jax.Array, active: jax.Array) -> PhysicsState:
-        arrays = state[:-1]
-        shapes = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arrays)
-        after, failed = jax.pure_callback(
-            simulator, (shapes, jax.ShapeDtypeStruct((), bool)), *arrays, control, active, vmap_method="broadcast_all"
-        )
-        after = contain_divergence(state, PhysicsState(*after, diverged=state.diverged), failed=failed)
+        arrays = state._replace(diverged=())
+        packed, unpack = ravel_pytree(arrays)  # one array each way: a callback costs time for every array
+        packed = jnp.concatenate([packed, control, active[None].astype(jnp.float32)])
+        result = jax.ShapeDtypeStruct((packed.size - model.nu,), jnp.float32)
+        values = jax.pure_callback(simulator, result, packed, vmap_method="broadcast_all")
+        after = unpack(values[:-1])._replace(diverged=state.diverged)
+        after = contain_divergence(state, after, failed=values[-1] > 0)
         return after._replace(diverged=jnp.where(active, after.diverged, state.diverged))
 
     return step

@@ -23,7 +23,7 @@ from fleetjax.priority.base import (
 )
 from fleetjax.priority.baselines import BASELINES
 from fleetjax.priority.dagger import DAGGERS
-from fleetjax.priority.orders import ORDERS
+from fleetjax.priority.orders import RULES
 from fleetjax.priority.ranks import above, lexicographic
 
 __all__ = [
@@ -39,5 +39,5 @@ __all__ = [
     "stateless",
 ]
 
-for _name, _algorithm in {**BASELINES, **DAGGERS, **ORDERS}.items():
+for _name, _algorithm in {**BASELINES, **DAGGERS, **RULES}.items():
     register_algorithm(_name, _algorithm)

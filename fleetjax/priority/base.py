@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 
 from fleetjax.allocation import Allocator, allocate
-from fleetjax.field import Field
+from fleetjax.field import PARAMETERS, Field
 from fleetjax.registry import Registry
 from fleetjax.types import Signals
 
@@ -66,6 +66,7 @@ def register_algorithm(name: str, algorithm: Algorithm) -> None:
         ValueError: if the name is taken.
     """
     ALGORITHMS.register(name, algorithm)
+    PARAMETERS[name] = algorithm.parameters
 
 
 def register_priority(

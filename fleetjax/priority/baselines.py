@@ -6,8 +6,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from fleetjax.envs import CUR_HUMAN_TIME
-from fleetjax.field import Field
+from fleetjax.environments import CUR_HUMAN_TIME
+from fleetjax.field import PARAMETERS
 from fleetjax.priority.base import Algorithm, Priority, stateless
 from fleetjax.priority.ranks import above
 
@@ -52,6 +52,6 @@ def as_many_humans(config) -> Mapping[str, Any]:
 BASELINES: dict[str, Algorithm] = {
     "constraint": Algorithm(constraint, updates=False, defaults=as_many_demonstrations),
     "constraint_trained": Algorithm(constraint, updates=False, defaults=as_many_gradient_steps),
-    "random": Algorithm(uniform, parameters={"random_threshold": Field("priority below which it is 0", high=1, default=0.9)}),
+    "random": Algorithm(uniform, parameters=PARAMETERS["random"]),
     "expert": Algorithm(everyone, pretrains=False, updates=False, defaults=as_many_humans),
 }

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from fleetjax.field import Field
+from fleetjax.field import PARAMETERS
 from fleetjax.priority.base import Algorithm, Priority, stateless
 from fleetjax.priority.ranks import above, lexicographic
 
@@ -65,12 +65,5 @@ def thrifty_dagger(config) -> Priority:
 
 DAGGERS: dict[str, Algorithm] = {
     "ensemble_dagger": Algorithm(ensemble_dagger),
-    "thrifty_dagger": Algorithm(
-        thrifty_dagger,
-        estimators=("goal",),
-        parameters={
-            "thrifty_weight": Field("weight of the chance of failure", high=1, default=0.25),
-            "thrifty_threshold": Field("normalised priority at or below which it is 0", default=3.25),
-        },
-    ),
+    "thrifty_dagger": Algorithm(thrifty_dagger, estimators=("goal",), parameters=PARAMETERS["thrifty_dagger"]),
 }

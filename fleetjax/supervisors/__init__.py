@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from fleetjax.envs import allegro_hand, block_push, navigation
 from fleetjax.envs.base import Env
 from fleetjax.precision import in_32_bits
 from fleetjax.registry import Registry
@@ -25,15 +26,11 @@ class Supervisor(NamedTuple):
 
 def _navigation(env: Env) -> Supervisor:
     del env
-    from fleetjax.envs import navigation
-
     return Supervisor(lambda state, key: navigation.teach(state))
 
 
 def _block_push(env: Env) -> Supervisor:
     del env
-    from fleetjax.envs import block_push
-
     return Supervisor(block_push.teach)
 
 
@@ -46,17 +43,11 @@ def _shipped(name: str, view: expert.View = expert.everything) -> Callable[[Env]
     return make_supervisor
 
 
-def _allegro_hand(env: Env) -> Supervisor:
-    from fleetjax.envs import allegro_hand
-
-    return _shipped("allegro_hand", allegro_hand.view)(env)
-
-
 SUPERVISORS: Registry[Callable[[Env], Supervisor]] = Registry("supervisor")
 _SHIPPED: dict[str, Callable[[Env], Supervisor]] = {
     "humanoid": _shipped("humanoid"),
     "anymal": _shipped("anymal"),
-    "allegro_hand": _allegro_hand,
+    "allegro_hand": _shipped("allegro_hand", allegro_hand.view),
     "block_push": _block_push,
     "navigation": _navigation,
 }

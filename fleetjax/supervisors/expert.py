@@ -1,14 +1,12 @@
 """Expert policies that ship with the package: small networks trained in this physics.
 
-Each expert is an npz and a JSON of its measured returns; `experiments/train_expert.py` writes both. The npz holds the mean and
-standard deviation of observations, and dense layers with ELU between them. Behind the last stands tanh, or the bound at which
-it is clipped.
+Each expert is an npz, and a JSON of its measured returns (see `fleetjax.expert_records`); `experiments/train_expert.py` writes
+both. The npz holds the mean and standard deviation of observations, and dense layers with ELU between them. Behind the last
+stands tanh, or the bound at which it is clipped.
 """
 
 import functools
-import json
 from collections.abc import Callable, Mapping
-from importlib import resources
 
 import jax
 import jax.numpy as jnp
@@ -16,28 +14,8 @@ import numpy as np
 
 from fleetjax import tree
 from fleetjax.envs.base import Env
+from fleetjax.expert_records import WEIGHTS
 from fleetjax.types import EnvState
-
-_WEIGHTS = resources.files("fleetjax.supervisors") / "weights"
-
-
-def record(name: str) -> dict:
-    """Return the training record of a shipped expert: steps, mean returns, share of full-length episodes.
-
-    Raises:
-        FileNotFoundError: if no expert of that name ships.
-    """
-    return json.loads((_WEIGHTS / f"{name}.json").read_text())
-
-
-def mean_return(name: str) -> float:
-    """Return the expert's mean undiscounted return over episodes of full length."""
-    return float(record(name)["mean_return_full_length"] or 0)
-
-
-def success_return(name: str, floor: float) -> float:
-    """Return the return above which an episode of full length succeeds: 95 % of the expert's mean, and no less than `floor`."""
-    return max(floor, 0.95 * mean_return(name))
 
 
 @functools.cache
@@ -47,7 +25,7 @@ def load_weights(name: str) -> dict[str, np.ndarray]:
     Raises:
         FileNotFoundError: if no expert of that name ships.
     """
-    with (_WEIGHTS / f"{name}.npz").open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+    with (WEIGHTS / f"{name}.npz").open("rb") as file, np.load(file, allow_pickle=False) as arrays:
         return dict(arrays)
 
 

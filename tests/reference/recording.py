@@ -1,28 +1,24 @@
 """Runs a fleet, writes down what the NumPy oracle must be told, and compares the two step by step."""
 
-import functools
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fleetjax import priority, supervisors
+from fleetjax import allocation, priority, supervisors
 from fleetjax.config import Config
 from fleetjax.envs import Env
 from fleetjax.fleet import Fleet, FleetState, make_fleet
+from fleetjax.keys import split_keys
 from fleetjax.learning import critic, imitation
 from fleetjax.learning.networks import Normalizer
 from fleetjax.metrics import Metrics, rohe
 from fleetjax.types import EnvState, HumanState, Plan
 from reference import oracle
 
-# Tests compile more than they compute: with these, XLA compiles a fleet in a quarter of the time.
-_OPTIONS = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-quick_jit = functools.partial(jax.jit, compiler_options=_OPTIONS)
-
 # Bound here, so that a fault seeded in the fleet's own tie-breaking does not reach what is recorded.
-draw_permutation = jax.random.permutation
+draw_order = allocation.tie_order
 
 
 class Trace(NamedTuple):
@@ -75,41 +71,39 @@ def record(
 
     def timestep(state: FleetState, _: None):
         key_t = jax.random.fold_in(key, state.timestep)
-        key_plan, key_human, key_advance = jax.random.split(key_t, 3)
-        key_score, key_ties = jax.random.split(key_plan)
-        key_env, key_reset, key_goal, key_data, _ = jax.random.split(key_advance, 5)
+        keys = split_keys(key_t, n)
         key_available, key_present = jax.random.split(jax.random.fold_in(key_t, 1))
 
         robot_action = learner.predict(state.policy, state.env.obs)[0]
-        human_action = jax.vmap(supervisor.act)(state.env, jax.random.split(key_human, n))
+        human_action = jax.vmap(supervisor.act)(state.env, keys.human)
         chance = {
             kind: parts.value(state.estimators[kind], state.policy.normalizer, state.env.obs, robot_action)
             for kind, parts in critics.items()
         }
         outcomes = {
-            name: jax.vmap(env.step)(state.env, action, jnp.ones(n, bool), jax.random.split(key_env, n))
+            name: jax.vmap(env.step)(state.env, action, jnp.ones(n, bool), keys.env)
             for name, action in {"robot": robot_action, "human": human_action}.items()
         }
         recorded = {
             "uncertainty": learner.predict(state.policy, state.env.obs)[1],
             "risk": chance.get("safety", jnp.zeros(n)),
             "goal": chance.get("goal", jnp.zeros(n)),
-            "uniform": jax.random.uniform(key_score, (n,)),
-            "tie_order": draw_permutation(key_ties, n),
-            "resample_bits": jax.random.bits(key_data, (state.human_data.resample.shape[1], n)),
+            "uniform": jax.random.uniform(keys.score, (n,)),
+            "tie_order": draw_order(keys.ties, n),
+            "resample_bits": jax.random.bits(keys.data, (state.human_data.resample.shape[1], n)),
             "available": jax.random.uniform(key_available, (m,)) >= absence,
             "present": jax.random.uniform(key_present, (n,)) >= silence,
             "robot_action": robot_action,
             "human_action": human_action,
-            "fresh": jax.vmap(env.reset)(jax.random.split(key_reset, n), jnp.arange(n)),
+            "fresh": jax.vmap(env.reset)(keys.reset, jnp.arange(n)),
         }
         for name, outcome in outcomes.items():
             recorded[f"after_{name}"] = recorded[f"renewed_{name}"] = outcome
             if env.next_goal:
-                recorded[f"renewed_{name}"] = jax.vmap(env.next_goal)(outcome, jax.random.split(key_goal, n))
+                recorded[f"renewed_{name}"] = jax.vmap(env.next_goal)(outcome, keys.goal)
 
-        planned, plan = fleet.plan(state, key_plan, recorded["available"])
-        after, metrics = fleet.advance(planned, plan, human_action, recorded["present"], key_advance)
+        planned, plan = fleet.plan(state, key_t, recorded["available"])
+        after, metrics = fleet.advance(planned, plan, human_action, recorded["present"], key_t)
 
         return after, (recorded, plan, metrics, after.env, after.humans, count_stored(after))
 

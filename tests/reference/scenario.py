@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy_envs
+from compiling import compiled
 
 import fleetjax
 from fleetjax import priority
 from fleetjax.learning import imitation
 from fleetjax.priority import Algorithm, Priority
 from reference import recording
-from reference.recording import quick_jit
 
 N, M, T, HORIZON = 4, 2, 12, 10
 TINY = {"hidden_sizes": (2,), "ensemble_size": 2, "batch_size": 4, "num_demonstrations": 4, "critic_capacity": 100}
@@ -39,7 +39,7 @@ def program(*, new_goals: bool = False, gradient_steps: int = 0) -> Any:
             fleet = fleetjax.make_fleet(config, env)
             return recording.record(config, env, fleet, start, jax.random.key(0), silence=silence)
 
-    return quick_jit(run)
+    return compiled(run)
 
 
 def play(

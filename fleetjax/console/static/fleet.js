@@ -2,7 +2,7 @@
 
 import { byId, connect, make, write } from "./common.js";
 
-const PANELS = ["Cumulative successes", "Cumulative hard resets", "Cumulative idle timesteps", "Return on human effort"];
+const PANELS = ["Cumulative successes", "Cumulative violations", "Cumulative idle timesteps", "Return on human effort"];
 const SVG = "http://www.w3.org/2000/svg";
 const [WIDTH, HEIGHT] = [240, 90];
 let facts = { steps: 1, robots: 0, seats: 0 };

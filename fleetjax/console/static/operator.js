@@ -23,11 +23,11 @@ const send = connect("/ws/operator", {
   },
   seat: sit,
   taken: (message) => choose(message.reason, message.free),
-  expired: () => stand("You were away for too long, and your seat is free again."),
+  expired: () => stand("You were away for too long, so your seat is free again."),
   left: () => stand("You have left your seat."),
   waiting: (message) => {
     send({ type: "seen" });
-    say(`You have a seat. It begins when ${message.wanted} are here; now: ${message.people}.`);
+    say(`You have a seat. The session starts when ${message.wanted} people are here; now there are ${message.people}.`);
   },
   ping: () => send({ type: "seen" }),
   state: update,

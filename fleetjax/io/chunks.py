@@ -8,10 +8,10 @@ import jax
 import numpy as np
 
 from fleetjax.config import Config
+from fleetjax.experiment import evaluate, prepare, simulate, without_teleoperation
 from fleetjax.fleet import FleetState, Interventions
 from fleetjax.learning.imitation import PolicyState
 from fleetjax.metrics import Metrics
-from fleetjax.run import evaluate, prepare, run, run_logged, without_teleoperation
 
 CHUNKS = 100  # that a run is divided into, more or less
 
@@ -35,7 +35,7 @@ def chunk_length(num_steps: int, within: int | None = None) -> int:
 
     Args:
         num_steps: timesteps of the run.
-        within: what chunks shall add up to without a remainder, which would be compiled anew; None = the run.
+        within: what chunks should add up to without a remainder, which would need a program of its own; None = the run.
 
     >>> chunk_length(10_000), chunk_length(20), chunk_length(10_005), chunk_length(10_007), chunk_length(10_000, 250)
     (100, 2, 115, 101, 125)
@@ -57,43 +57,28 @@ def chunks_of(num_steps: int, length: int) -> list[int]:
     return [*chunks[:-2], chunks[-2] + 1] if rest == 1 and full else chunks
 
 
+# The state's memory is used again: buffers can be large.
+_advance = jax.jit(simulate, static_argnames="logged", donate_argnames="state")
+
+
 def start(config: Config, key: jax.Array, length: int, *, logged: bool = False) -> FleetState:
     """Pre-train, and compile the first chunk of `length` timesteps meanwhile. Keyboard interrupts come through at once.
 
     Returns:
-        FleetState: the state at t = 0; `go_on` from it finds its program compiled.
+        FleetState: the state at t = 0; `run_chunks` from it finds its program compiled.
     """
-    first = config.replace(num_steps=length)
+    first = config.replace(num_steps=min(length, config.num_steps))
     pool = ThreadPoolExecutor(2)  # this thread only waits: an interrupt within JAX's own code could get lost
     try:
         lowered = pool.submit(lambda: jax.jit(prepare).lower(config, key)).result()
         state = pool.submit(lambda: jax.block_until_ready(lowered.compile()(config, key)))
-        pool.submit(lambda: _ADVANCE[logged].lower(first, key, lowered.out_info).compile()).result()
+        pool.submit(lambda: _advance.lower(first, key, lowered.out_info, logged=logged).compile()).result()
         return state.result()
     finally:
         pool.shutdown(wait=False)
 
 
-def _run_logged(config: Config, key: jax.Array, state: FleetState) -> tuple[Chunk, FleetState]:
-    result, interventions = run_logged(config, key, state)
-    return Chunk(result.metrics, interventions), result.state
-
-
-def _run(config: Config, key: jax.Array, state: FleetState) -> tuple[Chunk, FleetState]:
-    metrics, state = run(config, key, state)
-    return Chunk(metrics, None), state
-
-
-# Without and with a log of interventions. The state's memory is used again: buffers can be large.
-_ADVANCE = tuple(jax.jit(function, donate_argnums=2) for function in (_run, _run_logged))
-
-
-def shapes(config: Config, key: jax.Array) -> FleetState:
-    """Return shapes and types of a fleet's state; nothing is computed."""
-    return jax.eval_shape(prepare, config, key)
-
-
-def go_on(
+def run_chunks(
     config: Config, key: jax.Array, state: FleetState, lengths: list[int], *, logged: bool = False
 ) -> Iterator[tuple[Chunk, FleetState]]:
     """Run chunk after chunk; together they are `run(config, key, state)`.
@@ -109,29 +94,29 @@ def go_on(
         Chunk in numpy arrays and the state behind it, valid until the next one is asked for.
     """
     for length in lengths:
-        chunk, state = _ADVANCE[logged](config.replace(num_steps=length), key, state)
-        yield jax.device_get(chunk), state
+        (metrics, state), interventions = _advance(config.replace(num_steps=length), key, state, logged=logged)
+        yield jax.device_get(Chunk(metrics, interventions)), state
 
 
-def start_evaluation(config: Config, key: jax.Array, learner: PolicyState) -> Iterator[Metrics]:
+def start_evaluation(config: Config, key: jax.Array, policy: PolicyState) -> Iterator[Metrics]:
     """Compile the evaluation of a trained policy, and return what runs it, chunk after chunk.
 
     Returns:
-        Iterator of Metrics[C] in numpy arrays; together they are those of `evaluate(config, key, learner)`.
+        Iterator of Metrics[C] in numpy arrays; together they are those of `evaluate(config, key, policy)`.
     """
     length, *others = chunks_of(config.num_steps, chunk_length(config.num_steps))
     first = config.replace(num_steps=length)
-    begin = jax.jit(evaluate).lower(first, key, learner).compile()
+    begin = jax.jit(evaluate).lower(first, key, policy).compile()
     config = without_teleoperation(config)
     if others:
-        _ADVANCE[False].lower(config.replace(num_steps=others[0]), key, begin.out_info.state).compile()
+        _advance.lower(config.replace(num_steps=others[0]), key, begin.out_info.state, logged=False).compile()
 
-    def chunks() -> Iterator[Metrics]:
-        metrics, state = begin(first, key, learner)
+    def parts() -> Iterator[Metrics]:
+        metrics, state = begin(first, key, policy)
         yield jax.device_get(metrics)
-        yield from (chunk.metrics for chunk, _ in go_on(config, key, state, others))
+        yield from (chunk.metrics for chunk, _ in run_chunks(config, key, state, others))
 
-    return chunks()
+    return parts()
 
 
 def join(chunks: list[Metrics]) -> Metrics:

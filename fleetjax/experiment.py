@@ -1,7 +1,5 @@
 """A whole experiment: pre-train, then one scan over the fleet's timesteps; and the evaluation of what was learnt."""
 
-from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -9,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from fleetjax import envs
-from fleetjax.checks import check_run, check_state
+from fleetjax.checks import check_run
 from fleetjax.config import Config
-from fleetjax.fleet import FleetState, init, logged_step, make_fleet, make_parts
+from fleetjax.fleet import FleetState, init, logged_step, make_parts
+from fleetjax.keys import key_at
 from fleetjax.learning.imitation import PolicyState, create_data
 from fleetjax.learning.pretraining import pretrain
 from fleetjax.metrics import Metrics
@@ -49,8 +48,7 @@ def prepare(config: Config, key: jax.Array, env: envs.Env | None = None) -> Flee
     Reference: paper, Section 5.2.
     """
     env = check_run(config, env)
-    key_prepare, _ = jax.random.split(key)
-    key_policy, key_estimators, key_reset = jax.random.split(key_prepare, 3)
+    key_policy, key_estimators, key_reset = jax.random.split(key_at(key, -1), 3)
     parts = make_parts(config, env)
     policy, data = pretrain(config, env, parts.learner, parts.supervisor, key_policy)
     estimators = {
@@ -89,7 +87,6 @@ def extend(state: FleetState, num_pairs: int) -> FleetState:
     return state._replace(human_data=data._replace(pairs=pairs, resample=grow(data.resample)))
 
 
-@in_32_bits
 def run(config: Config, key: jax.Array, state: FleetState | None = None, env: envs.Env | None = None) -> Result:
     """Run a fleet for `config.num_steps` timesteps.
 
@@ -114,11 +111,9 @@ def run(config: Config, key: jax.Array, state: FleetState | None = None, env: en
 
     Reference: paper, Sections 3 and 4.
     """
-    metrics, last = _run(config, key, state, env, lambda env: make_fleet(config, env).step)
-    return Result(metrics, last)
+    return simulate(config, key, state, env, logged=False)[0]
 
 
-@in_32_bits
 def run_logged(
     config: Config, key: jax.Array, state: FleetState | None = None, env: envs.Env | None = None
 ) -> tuple[Result, Interventions]:
@@ -134,29 +129,27 @@ def run_logged(
         The Result of `run`, and Interventions[T, M].
 
     Raises:
-        ValueError: if the configuration is not valid.
+        ValueError: as `run` does.
     """
-    (metrics, interventions), last = _run(config, key, state, env, lambda env: partial(logged_step, make_parts(config, env)))
-    return Result(metrics, last), interventions
+    return simulate(config, key, state, env, logged=True)
 
 
-def _run(
-    config: Config, key: jax.Array, state: FleetState | None, env: envs.Env | None, make_step: Callable[[envs.Env], Any]
-) -> tuple[Any, FleetState]:
-    """Scan over the steps of a fleet; return what they give [T, ...] and the last state."""
-    env = check_run(config, env)
-    if state is not None:
-        check_state(config, env, state)
+@in_32_bits
+def simulate(
+    config: Config, key: jax.Array, state: FleetState | None = None, env: envs.Env | None = None, *, logged: bool
+) -> tuple[Result, Any]:
+    """Return the Result of `run` and, if `logged`, the Interventions[T, M] of `run_logged`; else None."""
+    env = check_run(config, env, state)
     start = prepare(config, key, env) if state is None else state
 
-    step = make_step(env)
-    _, key_steps = jax.random.split(key)
+    parts = make_parts(config, env)
 
     def timestep(state: FleetState, _: None) -> tuple[FleetState, Any]:
-        return step(state, jax.random.fold_in(key_steps, state.timestep))
+        after, (counts, interventions) = logged_step(parts, state, key_at(key, state.timestep))
+        return after, (counts, interventions if logged else None)
 
-    last, given = jax.lax.scan(timestep, start, length=config.num_steps)
-    return given, last
+    last, (metrics, interventions) = jax.lax.scan(timestep, start, length=config.num_steps)
+    return Result(metrics, last), interventions
 
 
 @in_32_bits
@@ -180,9 +173,8 @@ def evaluate(config: Config, key: jax.Array, policy: PolicyState, env: envs.Env 
     members = jax.tree.leaves(policy.params)[0].shape[0]
     config = without_teleoperation(config).replace(ensemble_size=members)
     env = check_run(config, env)
-    key_reset, _ = jax.random.split(key)
     nothing = create_data(env.spec, ensemble_size=members, capacity=1)
-    return run(config, key, init(make_parts(config, env), key_reset, policy, nothing, {}), env)
+    return run(config, key, init(make_parts(config, env), key_at(key, -1), policy, nothing, {}), env)
 
 
 def without_teleoperation(config: Config) -> Config:

@@ -1,0 +1,270 @@
+"""What the commands do, behind the command line: check all that was asked for, then compute, write and print."""
+
+import argparse
+import contextlib
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from fleetjax import envs
+from fleetjax.checks import check_run
+from fleetjax.config import make_config
+from fleetjax.console.controls import CONTROLS
+from fleetjax.envs import get_defaults, list_envs
+from fleetjax.field import every_field
+from fleetjax.io import chunks, export, files, flags, folder, formats, plain, resumable, text
+from fleetjax.io.errors import Refusal
+from fleetjax.io.progress import progress, say
+from fleetjax.metrics import Metrics
+from fleetjax.priority import get_algorithm, list_algorithms
+
+EVALUATED = ("successes", "violations", "hard_resets", "idle", "human_steps", "moving", "reward")
+
+
+@contextlib.contextmanager
+def _refusing() -> Iterator[None]:
+    """Turn the ValueErrors of validation, and of reading files, into refusals."""
+    try:
+        yield
+    except ValueError as error:
+        raise Refusal(str(error)) from error
+
+
+def run_fleet(arguments: argparse.Namespace) -> None:
+    """Run a new fleet, or resume a run."""
+    given = _parameters(arguments)
+    with _refusing():
+        if arguments.checkpoint_every < 0 or arguments.checkpoint_every == 1:
+            raise ValueError(f"checkpoint_every = {arguments.checkpoint_every} must be 0 (none) or at least 2 timesteps")
+        run = _run_to_resume(arguments, given) if arguments.resume else _new_run(arguments, given)
+    if not arguments.resume:
+        folder.check_folder(run.folder, overwrite=arguments.overwrite)
+        run.folder.mkdir(parents=True, exist_ok=True)
+    with files.lock(run.folder):
+        begun = time.monotonic()
+        with _refusing():
+            metrics = folder.read_finished(run) if arguments.resume else None
+        if metrics:
+            say(f"{run.folder} is already finished; there is nothing to resume")
+        else:
+            options = {"resume": bool(arguments.resume), "checkpoint_every": arguments.checkpoint_every}
+            metrics = resumable.run_in_folder(run, **options)
+        _report(run, metrics, f"{text.duration(time.monotonic() - begun)} in all")
+
+
+def _parameters(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the parameters of a run that were given, by name."""
+    return {name: value for name, value in vars(arguments).items() if name in every_field()}
+
+
+def _new_run(arguments: argparse.Namespace, given: Mapping[str, Any]) -> folder.Run:
+    """Return a new run.
+
+    Raises:
+        ValueError: if the configuration cannot be used.
+    """
+    if "environment" not in given:
+        known = CONTROLS if arguments.command == "console" else list_envs()
+        resume = ", or resume a run with --resume RUN" if arguments.command == "run" else ""
+        raise ValueError(f"ENV is missing; choose one of {', '.join(known)}{resume}")
+    overrides = {name: value for name, value in given.items() if name not in ("environment", "algorithm")}
+    config, seed = make_config(given["environment"], given.get("algorithm", "cur"), **overrides), arguments.seed or 0
+    check_run(config)
+    logged = arguments.command == "run" and arguments.log_interventions
+    return folder.Run(arguments.output or folder.default_folder(config, seed), config, seed, logged)
+
+
+def _run_to_resume(arguments: argparse.Namespace, given: Mapping[str, Any]) -> folder.Run:
+    """Return the run to resume.
+
+    Raises:
+        ValueError: if there is none, or other parameters were given than it has.
+    """
+    if arguments.output or arguments.overwrite:
+        raise ValueError("--resume continues in the run's own folder; omit --output and --overwrite")
+    run = folder.read_run(arguments.resume)
+    if folder.RECORD in run.digests or (run.folder / folder.RECORD).exists():
+        raise ValueError(f"{run.folder} was supervised by people, so it cannot be resumed; repeat it with fleetjax replay")
+    if arguments.log_interventions and not run.logged:
+        raise ValueError("the run does not log interventions; omit --log-interventions, or start a new run")
+    has = plain.to_plain(run.config) | {"seed": run.seed}
+    asked = plain.to_plain(run.config.replace(**given)) | {"seed": run.seed if arguments.seed is None else arguments.seed}
+    for name, value in asked.items():
+        if value != has[name]:
+            raise ValueError(f"{name} = {value}, but the run has {has[name]}; omit it, or start a new run")
+    return run
+
+
+def _report(run: folder.Run, metrics: Metrics, last: str) -> None:
+    print(f"\n{text.headline(run.config, run.seed)}\n\n{text.run_table(metrics, run.config)}\n")
+    print(f"{last}. Run folder: {run.folder}")
+
+
+def list_all(arguments: argparse.Namespace) -> None:
+    """Show environments and algorithms."""
+    del arguments
+    print("environments")
+    rows: list[tuple[str, ...]] = [("", "name", "observations", "actions", "horizon", "control step", "goals")]
+    for name in list_envs():
+        spec = envs.make(name).spec
+        sizes = map(str, (spec.observation_size, spec.action_size, spec.horizon))
+        rows.append(("", name, *sizes, f"{1000 * spec.control_step:.1f} ms", "yes" if spec.has_goal else "no"))
+    print(text.table(rows, right=[2, 3, 4, 5]))
+    for name in list_envs():
+        changed = {field: value for field, value in get_defaults(name).items() if value != every_field()[field].default}
+        print(f"  {name}'s own defaults: {', '.join(f'{field} {flags.show(value)}' for field, value in changed.items())}")
+    print("\nalgorithms")
+    named = [name for name in list_algorithms() if not text.is_order(name) or name == "cur"]
+    print(text.table([("", name, text.label(name), text.meaning(name)) for name in named]))
+    for name in list_algorithms():
+        for own, field in get_algorithm(name).parameters.items():
+            print(f"  {name}'s own parameter: {own} {flags.show(field.default)}, {field.help}")
+    print(f"  and {text.ORDERS}")
+
+
+def plot_runs(arguments: argparse.Namespace) -> None:
+    """Draw runs in one figure."""
+    from fleetjax.io import figure  # matplotlib takes a while to import
+
+    with _refusing():
+        figure.check_format(arguments.output)
+        runs = [folder.read_run(path) for path in arguments.runs]
+        data = [(run.config, run.seed, folder.read_metrics(run)) for run in runs]
+    output = files.check_free(arguments.output, overwrite=arguments.overwrite)
+    groups = figure.group(data)
+    for run, (_, _, metrics) in zip(runs, data, strict=True):
+        if len(metrics.successes) < run.config.num_steps:
+            say(f"{run.folder} was interrupted; curves with the same settings end at {len(metrics.successes)} timesteps")
+    skipped = len(data) - sum(len(curves.values) for curves in groups)
+    if skipped:
+        say(f"skipped {text.plural(skipped, 'run')} with the same settings and seed as a later one")
+    drawn = figure.draw(groups)
+    files.write(output, figure.render(drawn, arguments.output.suffix))
+    print(arguments.output)
+
+
+def evaluate_policy(arguments: argparse.Namespace) -> None:
+    """Run a trained policy without teleoperation."""
+    with _refusing():
+        run = folder.read_run(arguments.run)
+        config = run.config.replace(num_steps=arguments.num_steps)
+        check_run(config)
+        if not get_algorithm(config.algorithm).pretrains:
+            raise ValueError(f"algorithm = {config.algorithm!r} trains no policy, so there is nothing to evaluate")
+        policy = folder.read_policy(run)
+    output = files.check_free(run.folder / folder.EVALUATION, overwrite=arguments.overwrite)
+    seed = (run.seed + 1) % 2**32 if arguments.seed is None else arguments.seed
+    parts: list[Metrics] = []
+    say(f"{text.headline(config, seed)}, nobody teleoperates: compiling ...")
+    evaluation = chunks.start_evaluation(config, jax.random.key(seed), policy)
+    with progress(config, with_rohe=False) as show:
+        for metrics in evaluation:
+            parts.append(metrics)
+            show(metrics)
+    metrics = chunks.join(parts)
+    total = {name: np.sum(getattr(metrics, name)).item() for name in EVALUATED}
+    content = {"num_steps": config.num_steps, "seed": seed, "totals": total, "versions": folder.versions()}
+    print(text.evaluation_table(metrics, config), flush=True)  # the disk may have filled up meanwhile
+    files.write_json(output, content)
+
+
+def export_interventions(arguments: argparse.Namespace) -> None:
+    """Write a run's interventions as a data set."""
+    with _refusing():
+        formats.check(arguments.format)
+        run = folder.read_run(arguments.run)
+        found = folder.read_interventions(run)
+    name = "robomimic.hdf5" if arguments.format == "robomimic" else arguments.format
+    output = arguments.output or run.folder / name
+    files.check_free(output, overwrite=arguments.overwrite, is_folder=arguments.format != "robomimic")
+    with _refusing():
+        export.export(found, run.config, envs.make(run.config.environment, run.config.backend).spec, output, arguments.format)
+    steps = sum(map(len, found))
+    say(f"{text.plural(len(found), 'intervention')}, {text.plural(steps, 'timestep')} of human actions")
+    print(output)
+
+
+def render_robots(arguments: argparse.Namespace) -> None:
+    """Draw robots as an animation."""
+    from fleetjax.io import render
+
+    path = Path(arguments.source)
+    with _refusing():
+        for name, low in {"num_shown": 1, "num_steps": 1, "every": 1, "width": 1, "skip": 0}.items():
+            if getattr(arguments, name) < low:
+                raise ValueError(f"{name} = {getattr(arguments, name)} must be at least {low}")
+        render.check_format(arguments.output)
+        run = None if arguments.source in list_envs() else folder.read_run(path)
+        who = arguments.policy or ("robot" if run else "expert")
+        if who == "robot" and run is None:
+            raise ValueError(f"--policy robot needs a run folder, but {arguments.source} is an environment")
+        config = run.config if run else make_config(arguments.source, "cur")
+        if who == "expert":
+            shown = {"num_robots": arguments.num_shown, "num_humans": arguments.num_shown}
+            config = make_config(config.environment, "expert", **shown, backend=config.backend)
+        policy = folder.read_policy(run) if run and who == "robot" else None
+        render.check(config)
+    output = files.check_free(arguments.output, overwrite=arguments.overwrite)
+    seed = arguments.seed if arguments.seed is not None else run.seed if run else 0
+    key = jax.random.key(seed)
+    say(f"{text.headline(config, seed)}, policy {who}: running ...")
+    config = config.replace(num_steps=arguments.skip + arguments.num_steps)  # whose human data there is room for
+    config, state = render.start(config, key, policy, skip=arguments.skip)
+    film = render.shoot(config.replace(num_steps=arguments.num_steps), key, state, num_shown=arguments.num_shown)
+    say("drawing ...")
+    env = envs.make(config.environment, config.backend)
+    pictures = render.draw(film, env.scene, width=arguments.width, every=arguments.every)
+    rate = 1 / (env.spec.control_step * arguments.every)
+    with _refusing():
+        files.write(output, render.encode(pictures, arguments.output, rate=rate))
+    print(arguments.output)
+
+
+def supervise(arguments: argparse.Namespace) -> None:
+    """Let people supervise a fleet."""
+    from fleetjax.console import command
+
+    with _refusing():
+        run = _new_run(arguments, _parameters(arguments))
+        if arguments.interval is None:
+            arguments.interval = envs.make(run.config.environment, run.config.backend).spec.control_step
+        names = ("host", "port", "token", "interval", "timeout", "wait")
+        command.check(run.config, **{name: getattr(arguments, name) for name in names})
+    folder.check_folder(run.folder, overwrite=arguments.overwrite)
+
+    from fleetjax.console import server  # its libraries may be missing, which `check` tells
+
+    options = server.Options(**{name: getattr(arguments, name) for name in names}, simulated=arguments.fill == "simulated")
+    with contextlib.closing(server.listen(arguments.host, arguments.port)) as listener:
+        run.folder.mkdir(parents=True, exist_ok=True)
+        with files.lock(run.folder):
+            metrics = command.supervise(run, options, listener)
+    _report(run, metrics, f"{text.plural(len(metrics.successes), 'timestep')} recorded")
+
+
+def replay(arguments: argparse.Namespace) -> None:
+    """Run a console's session again from its record, and compare every bit."""
+    from fleetjax.console import replaying
+
+    with _refusing():
+        run = folder.read_run(arguments.run)
+        rows = replaying.read_record(run)
+    metrics = replaying.replay(run, rows)
+    compared = " and ".join(replaying.compared(run.config))
+    print(f"{run.folder}: {text.plural(len(metrics.successes), 'timestep')} replayed; {compared} agree to the bit")
+
+
+COMMANDS: Mapping[str, Callable[[argparse.Namespace], None]] = {
+    "run": run_fleet,
+    "list": list_all,
+    "plot": plot_runs,
+    "evaluate": evaluate_policy,
+    "export": export_interventions,
+    "render": render_robots,
+    "console": supervise,
+    "replay": replay,
+}

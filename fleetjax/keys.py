@@ -1,0 +1,43 @@
+"""Where a run's randomness comes from: the key of each timestep, and the keys of all that happens in it."""
+
+from typing import NamedTuple
+
+import jax
+
+
+class Keys(NamedTuple):
+    """The keys of one timestep.
+
+    Attributes:
+        score: for the rule.
+        ties: for the allocator.
+        data: for recording human data.
+        learn: for the gradient steps.
+        human: key[N], for the supervisor.
+        env: key[N], for the robots' steps.
+        reset: key[N], for their resets.
+        goal: key[N], for their new goals.
+    """
+
+    score: jax.Array
+    ties: jax.Array
+    data: jax.Array
+    learn: jax.Array
+    human: jax.Array
+    env: jax.Array
+    reset: jax.Array
+    goal: jax.Array
+
+
+def key_at(key: jax.Array, timestep: jax.Array | int) -> jax.Array:
+    """Return the key of a timestep in the run that has `key`; timestep -1 stands for all that comes before the first.
+
+    A run resumed at any timestep therefore draws what it would have drawn.
+    """
+    return jax.random.fold_in(key, timestep + 1)
+
+
+def split_keys(key: jax.Array, num_robots: int) -> Keys:
+    """Return the keys of the timestep whose key is given, by a single split, which compiles and runs fastest."""
+    keys = jax.random.split(key, 4 * (1 + num_robots))
+    return Keys(*keys[:4], *keys[4:].reshape(4, num_robots))

@@ -72,6 +72,12 @@ def median_seconds(function: Callable[..., Any], *args: Any, repeats: int = 5) -
     return statistics.median(seconds(function, *args)[0] for _ in range(repeats))
 
 
+def same_again(env: fleetjax.Env, obs: jax.Array) -> jax.Array:
+    """Return actions f32[N, A] that repeat the last controls, given observations f32[N, O], which end with them."""
+    last = obs[:, -env.spec.action_size :]
+    return jnp.zeros_like(last) if env.spec.name == "allegro_hand" else last  # the hand's actions change its targets
+
+
 def body_of(physics: Any) -> PhysicsState:
     """Return what the physics backends step, out of an environment's own state."""
     return physics if isinstance(physics, PhysicsState) else physics.body

@@ -60,8 +60,6 @@ def make_env(*, backend: str = "auto", success_return: float | None = None) -> b
         supervisor="anymal",
         success_return=success_return,
     )
-        "anymal", 48, physics.model.nu, HORIZON, physics.control_step, supervisor="anymal", success_return=success_return
-    )
 
     def reset(key: jax.Array, robot: jax.Array) -> EnvState:
         del robot  # every robot starts from the same distribution

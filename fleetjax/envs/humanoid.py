@@ -42,8 +42,6 @@ def make_env(*, backend: str = "auto", success_return: float | None = None) -> b
         supervisor="humanoid",
         success_return=success_return,
     )
-        "humanoid", 108, physics.model.nu, HORIZON, physics.control_step, supervisor="humanoid", success_return=success_return
-    )
     joints = _Joints(physics.model)
 
     def reset(key: jax.Array, robot: jax.Array) -> EnvState:

@@ -45,7 +45,7 @@ class Config(Fields):
                 raise ValueError(_not_known(name, changes.get("algorithm", self.algorithm)))
         typed = {name: _typed(name, known[name], value) for name, value in changes.items()}
         own = self.parameters
-        if "algorithm" in changes and changes["algorithm"] != self.algorithm:
+        if not own or changes.get("algorithm", self.algorithm) != self.algorithm:
             own = _default_parameters(changes.get("environment", self.environment), changes["algorithm"])
         own = {**own, **{name: typed.pop(name) for name in list(typed) if name not in FIELDS}}
         return _with_capacity(self, dataclasses.replace(self, **typed, parameters=own), changes)

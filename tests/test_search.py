@@ -37,7 +37,7 @@ def test_values_between_0_and_1_stay_there(place):
 
 def test_a_hump_is_crossed():
     """Human time need not fall with a threshold."""
-    found = solve(lambda x: 100 + 50 * math.exp(-(math.log(x) ** 2)), 140, 0.2, PLAIN, tolerance=0.01, most=20)
+    found = solve(lambda x: 100 + 50 * math.exp(-(math.log(x) ** 2) / 4), 140, 0.2, PLAIN, tolerance=0.01, most=20)
     assert found[-1][1] == pytest.approx(140, rel=0.01)
 
 

@@ -206,8 +206,8 @@ def sealed(value: Any) -> Any:
 def read_all(path: Path) -> None:
     run = folder.read_run(path)
     folder.read_metrics(run)
-    folder.read_policy(run)
     folder.read_interventions(run)
+    folder.read_policy(run)  # takes longest
 
 
 @FEW

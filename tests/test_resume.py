@@ -115,6 +115,7 @@ def test_what_was_not_logged_is_not_exported(whole, tmp_path, capsys):
     assert "does not log interventions" in refused(capsys, "run", "--resume", path, "--log-interventions")
 
 
+@pytest.mark.usefixtures("compiled_both_ways")
 def test_ctrl_c_writes_a_checkpoint_from_which_the_run_goes_on(stopped, whole, capsys):
     assert set(contents(stopped)) == {"config.json", "metrics.csv", "figure.png", "interventions.bin"}
     assert (stopped / "metrics.csv").read_text().splitlines() == (whole / "metrics.csv").read_text().splitlines()[:67]
@@ -142,6 +143,7 @@ def test_a_second_ctrl_c_stops_at_once_and_the_run_goes_on_from_an_older_checkpo
     assert_same(path, whole)
 
 
+@pytest.mark.usefixtures("compiled_both_ways")
 @pytest.mark.parametrize("every", [45, 119])
 def test_any_chunk_length_and_any_stop_give_the_same_bits(tmp_path, monkeypatch, whole, every):
     path = tmp_path / "stopped"

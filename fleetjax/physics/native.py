@@ -89,7 +89,7 @@ def make_step(model: mujoco.MjModel, substeps: int) -> Callable[[PhysicsState, j
     def step(state: PhysicsState, control: jax.Array, active: jax.Array) -> PhysicsState:
         arrays = state._replace(diverged=())
         packed, unpack = ravel_pytree(arrays)  # one array each way: a callback costs time for every array
-        packed = jnp.concatenate([packed, control, active[None].astype(jnp.float32)])
+        packed = jnp.concatenate([packed, control, jnp.float32(active)[None]])
         result = jax.ShapeDtypeStruct((packed.size - model.nu,), jnp.float32)
         values = jax.pure_callback(simulator, result, packed, vmap_method="broadcast_all")
         after = unpack(values[:-1])._replace(diverged=state.diverged)

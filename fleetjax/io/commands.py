@@ -16,7 +16,7 @@ from fleetjax.config import make_config
 from fleetjax.console.controls import CONTROLS
 from fleetjax.envs import get_defaults, list_envs
 from fleetjax.field import every_field
-from fleetjax.io import chunks, export, files, flags, folder, formats, plain, resumable, text
+from fleetjax.io import chunks, export, files, flags, folder, formats, resumable, study, sweep, text
 from fleetjax.io.errors import Refusal
 from fleetjax.io.progress import progress, say
 from fleetjax.metrics import Metrics
@@ -38,8 +38,7 @@ def run_fleet(arguments: argparse.Namespace) -> None:
     """Run a new fleet, or resume a run."""
     given = _parameters(arguments)
     with _refusing():
-        if arguments.checkpoint_every < 0 or arguments.checkpoint_every == 1:
-            raise ValueError(f"checkpoint_every = {arguments.checkpoint_every} must be 0 (none) or at least 2 timesteps")
+        resumable.check_interval(arguments.checkpoint_every)
         run = _run_to_resume(arguments, given) if arguments.resume else _new_run(arguments, given)
     if not arguments.resume:
         folder.check_folder(run.folder, overwrite=arguments.overwrite)
@@ -91,17 +90,27 @@ def _run_to_resume(arguments: argparse.Namespace, given: Mapping[str, Any]) -> f
         raise ValueError(f"{run.folder} was supervised by people, so it cannot be resumed; repeat it with fleetjax replay")
     if arguments.log_interventions and not run.logged:
         raise ValueError("the run does not log interventions; omit --log-interventions, or start a new run")
-    has = plain.to_plain(run.config) | {"seed": run.seed}
-    asked = plain.to_plain(run.config.replace(**given)) | {"seed": run.seed if arguments.seed is None else arguments.seed}
-    for name, value in asked.items():
-        if value != has[name]:
-            raise ValueError(f"{name} = {value}, but the run has {has[name]}; omit it, or start a new run")
+    seed = run.seed if arguments.seed is None else arguments.seed
+    difference = folder.first_difference(run._replace(config=run.config.replace(**given), seed=seed), run)
+    if difference:
+        raise ValueError(f"{difference}; omit it, or start a new run")
     return run
 
 
 def _report(run: folder.Run, metrics: Metrics, last: str) -> None:
     print(f"\n{text.headline(run.config, run.seed)}\n\n{text.run_table(metrics, run.config)}\n")
     print(f"{last}. Run folder: {run.folder}")
+
+
+def run_sweep(arguments: argparse.Namespace) -> None:
+    """Run every combination of several values."""
+    with _refusing():
+        subjects = [name for names in arguments.subjects for name in names]
+        asked = study.make_study(subjects, vars(arguments))
+        resumable.check_interval(asked.checkpoint_every)
+        runs = study.plan(asked)
+        sweep.check_folder(asked, runs)
+    sweep.run_all(asked, runs)
 
 
 def list_all(arguments: argparse.Namespace) -> None:
@@ -260,6 +269,7 @@ def replay(arguments: argparse.Namespace) -> None:
 
 COMMANDS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "run": run_fleet,
+    "sweep": run_sweep,
     "list": list_all,
     "plot": plot_runs,
     "evaluate": evaluate_policy,

@@ -13,6 +13,7 @@ from fleetjax.environments import get_defaults, list_envs
 from fleetjax.field import FIELDS, Field, every_field, owners
 from fleetjax.io.errors import Refusal
 from fleetjax.io.formats import FORMATS
+from fleetjax.io.lists import listed, sizes
 from fleetjax.registry import unknown
 from fleetjax.version import VERSION
 
@@ -25,12 +26,19 @@ Interactive fleet learning: N robots, M humans. Who should get help, and what do
   fleetjax run navigation               a small fleet, finished in a minute
   fleetjax run humanoid                 the paper's main experiment, C.U.R. with 100 humanoids
   fleetjax run humanoid --help          every parameter, with its meaning, unit and default
+  fleetjax sweep navigation --seeds 5 --output DIR   many runs, in parallel
   fleetjax plot runs/humanoid-*         runs in one figure; seeds become a mean and a band
   fleetjax evaluate RUN                 the trained policy on its own; nobody teleoperates
   fleetjax console navigation --humans 2   real people supervise, in their browsers"""
 _RUN_ABOUT = """\
 Clone demonstrations, then run the fleet while it learns from those who help it. Prints a table at the end and writes a run
 folder: config.json, metrics.csv (one row per timestep), figure.png, policy.msgpack and the last two checkpoints."""
+_SWEEP_ABOUT = """\
+Run every combination of several values in parallel, each in a run folder of its own below DIR. The same command resumes a sweep
+that was stopped, and a larger one extends it.
+
+Every parameter takes a list: --algorithm cur,random --num-humans 5,10 --hidden-sizes 64 64,256 256. A parameter of one
+algorithm is given to that algorithm alone. A FILE holds the same names with lists, in TOML; flags override it."""
 _RUN_NOTE = """\
 Some algorithms change defaults: expert has as many humans as robots; constraint gets as many extra demonstrations as C.U.R.
 uses human timesteps; constraint_trained also takes as many gradient steps before the start as the others take in total."""
@@ -92,6 +100,7 @@ def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser
     parser.add_argument("--version", action="version", version=f"fleetjax {VERSION}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands")
     _add_run(commands, environment)
+    _add_sweep(commands, environment)
     commands.add_parser("list", help="show environments and algorithms")
 
     plot = commands.add_parser("plot", help="draw runs in one figure; seeds become a mean and a band")
@@ -163,6 +172,27 @@ def _add_run(commands: Any, environment: str | None) -> None:
     _add_parameters(run, environment)
 
 
+def _add_sweep(commands: Any, environment: str | None) -> None:
+    usage = "fleetjax sweep ENV... --output DIR [--seeds N] [--workers W] [parameters, each with a list of values]\n"
+    usage += "       fleetjax sweep FILE.toml [the same]"
+    sweep = commands.add_parser(
+        "sweep", help="run every combination of several values, in parallel", usage=usage, description=_SWEEP_ABOUT
+    )
+    environments = f"environments: {', '.join(list_envs())}; or a .toml file that says what to run"
+    sweep.add_argument("subjects", metavar="ENV|FILE", nargs="*", type=listed(str), help=environments)
+    options: dict[str, Any] = {"default": argparse.SUPPRESS}
+    sweep.add_argument("--seeds", metavar="N", type=_integer, help="as many seeds: 0 to N - 1 [default: 1]", **options)
+    sweep.add_argument("--seed", metavar="N,...", type=listed(_seed), help="these seeds", **options)
+    sweep.add_argument("--output", metavar="DIR", type=Path, help="folder for the run folders", **options)
+    workers = "processes, which share the cores [default: one for each core]"
+    sweep.add_argument("--workers", metavar="W", type=_integer, help=workers, **options)
+    every = "timesteps between the checkpoints of a run; 0 = none [default: 1000]"
+    sweep.add_argument("--checkpoint-every", metavar="N", type=_integer, help=every, **options)
+    logged = "log what teleoperating humans see and do, for `fleetjax export`"
+    sweep.add_argument("--log-interventions", action="store_true", help=logged, **options)
+    _add_parameters(sweep, environment, with_lists=True)
+
+
 def _add_console(commands: Any, environment: str | None) -> None:
     usage = "fleetjax console ENV --humans M [--host HOST --token TOKEN] [--port N] [--output DIR] [parameters]"
     console = commands.add_parser(
@@ -193,29 +223,56 @@ def _add_console(commands: Any, environment: str | None) -> None:
     _add_parameters(console, environment, short={"num_humans": "--humans"})
 
 
-def _add_parameters(command: Any, environment: str | None, short: Mapping[str, str] = MappingProxyType({})) -> None:
+def _add_parameters(
+    command: Any,
+    environment: str | None,
+    short: Mapping[str, str] = MappingProxyType({}),
+    *,
+    with_lists: bool = False,
+) -> None:
     """Add a flag for each field of `Config`, with a short form for some, and for each parameter of an algorithm."""
+    add = _add_list if with_lists else _add_field
     fields = command.add_argument_group(f"parameters{f' (defaults of {environment})' if environment else ''}")
     own = command.add_argument_group("parameters of one algorithm each")
     for name, field in every_field().items():
         if name in FIELDS and name != "environment":
-            _add_field(fields, name, field, environment, *([short[name]] if name in short else []))
+            add(fields, name, field, environment, *([short[name]] if name in short else []))
         elif name not in FIELDS:
-            _add_field(own, name, field._replace(help=f"{', '.join(owners(name))}: {field.help}"), environment)
+            add(own, name, field._replace(help=f"{', '.join(owners(name))}: {field.help}"), environment)
 
 
 def _add_field(group: Any, name: str, field: Field, environment: str | None, *short: str) -> None:
-    unit = f" ({field.unit})" if field.unit else ""
-    options: dict[str, Any] = {"default": argparse.SUPPRESS}
+    options: dict[str, Any] = {"default": argparse.SUPPRESS, "help": _help(name, field, environment)}
     if field.kind is bool:
         options |= {"action": argparse.BooleanOptionalAction}
     elif field.kind is tuple:
         options |= {"type": _integer, "nargs": "+", "metavar": "N"}
     else:
-        kinds = {str: (str, "NAME"), int: (_integer, "N"), float: (_number, "X")}
-        options["type"], options["metavar"] = kinds[field.kind]
-    text = f"{field.help}{unit} [default: {_default(name, field, environment)}]".replace("%", "%%")
-    group.add_argument(f"--{name.replace('_', '-')}", *short, help=text, **options)
+        options["type"], options["metavar"] = _KINDS[field.kind]
+    group.add_argument(_flag(name), *short, **options)
+
+
+def _add_list(group: Any, name: str, field: Field, environment: str | None) -> None:
+    """Add a flag that takes several values of a parameter, separated by commas, in place of one."""
+    options: dict[str, Any] = {"default": argparse.SUPPRESS, "help": _help(name, field, environment)}
+    if field.kind is tuple:
+        options |= {"action": sizes(_integer), "nargs": "+", "metavar": "N"}
+    else:
+        read, letter = _KINDS[field.kind]
+        options |= {"type": listed(read), "metavar": f"{letter},..."}
+    if field.kind is bool:
+        options |= {"nargs": "?", "const": [True]}
+        group.add_argument(f"--no-{_flag(name)[2:]}", dest=name, action="store_const", const=[False], default=argparse.SUPPRESS)
+    group.add_argument(_flag(name), **options)
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def _help(name: str, field: Field, environment: str | None) -> str:
+    unit = f" ({field.unit})" if field.unit else ""
+    return f"{field.help}{unit} [default: {_default(name, field, environment)}]".replace("%", "%%")
 
 
 def _default(name: str, field: Field, environment: str | None) -> str:
@@ -249,7 +306,21 @@ def _number(text: str) -> float:
         raise argparse.ArgumentTypeError(f"{text!r} must be a number") from None
 
 
+def _switch(text: str) -> bool:
+    if text not in ("on", "off"):
+        raise argparse.ArgumentTypeError(f"{text!r} must be on or off")
+    return text == "on"
+
+
 def _seed(text: str) -> int:
     if not text.isascii() or not text.isdecimal() or int(text) > _LARGEST_SEED:
         raise argparse.ArgumentTypeError(f"{text!r} must be a whole number from 0 to {_LARGEST_SEED}")
     return int(text)
+
+
+_KINDS = {  # what reads a value, and what stands for it in the help
+    str: (str, "NAME"),
+    int: (_integer, "N"),
+    float: (_number, "X"),
+    bool: (_switch, "on|off"),
+}

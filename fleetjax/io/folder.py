@@ -151,6 +151,13 @@ def identity(config: Config, seed: int) -> dict[str, Any]:
     return {"config": plain.to_plain(config), "seed": seed}
 
 
+def first_difference(asked: Run, found: Run) -> str:
+    """Return how the first setting that differs differs: "num_steps = 300, but the run has 120"; "" if none does."""
+    runs = (asked, found)
+    wanted, has = (plain.to_plain(x.config) | {"seed": x.seed, "log_interventions": x.logged} for x in runs)
+    return next((f"{name} = {value}, but the run has {has[name]}" for name, value in wanted.items() if value != has[name]), "")
+
+
 def write_policy(folder: Path, policy: PolicyState) -> None:
     """Write `policy.msgpack`: the ensemble's parameters [E, ...] and the normalizer, by flax's serialization."""
     files.write(folder / POLICY, serialization.to_bytes(_stored(policy)))

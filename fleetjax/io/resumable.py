@@ -40,6 +40,43 @@ class Start(NamedTuple):
     notes: Mapping[str, Any]
 
 
+def check_interval(checkpoint_every: int) -> None:
+    """Check the timesteps between checkpoints.
+
+    Raises:
+        ValueError: if there can be none that often.
+    """
+    if checkpoint_every < 0 or checkpoint_every == 1:
+        raise ValueError(f"checkpoint_every = {checkpoint_every} must be 0 (none) or at least 2 timesteps")
+
+
+def complete(run: folder.Run, *, checkpoint_every: int) -> None:
+    """Run what is left of a run, whatever its folder holds of it: nothing yet, a part, or all.
+
+    Args:
+        run: its folder and its configuration, and whether interventions are logged.
+        checkpoint_every: timesteps between checkpoints; 0 = none.
+
+    Raises:
+        ValueError: if the folder holds another run, or a damaged one.
+        BlockingIOError: if another process works on it.
+        Exception: as `run_in_folder` does.
+    """
+    run.folder.mkdir(parents=True, exist_ok=True)
+    with files.lock(run.folder):
+        begun = folder.is_run(run.folder)
+        if begun:
+            asked, run = run, folder.read_run(run.folder)
+            difference = folder.first_difference(asked, run)
+            if difference:
+                raise ValueError(f"{difference} in {run.folder}; choose another --output")
+            if folder.read_finished(run):
+                return
+        else:
+            folder.check_folder(run.folder, overwrite=False)
+        run_in_folder(run, resume=begun, checkpoint_every=checkpoint_every)
+
+
 def run_in_folder(run: folder.Run, *, resume: bool, checkpoint_every: int) -> Metrics:
     """Run what is left of a run. An older run in its folder is deleted once there are timesteps to take its place.
 

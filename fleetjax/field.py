@@ -91,6 +91,7 @@ FIELDS: dict[str, Field] = {f.name: f.metadata["field"] for f in dataclasses.fie
 
 # The orders of C, U and R, such as C.U.R.
 ORDERS = tuple("".join(letters) for size in (3, 2, 1) for letters in itertools.permutations("cur", size))
+ORDERS_WITH_C = tuple(letters for letters in ORDERS if "c" in letters)
 _IDLE = Field(
     "in the initial period, humans whom nobody else needs teleoperate random robots", kind=bool, high=None, default=False
 )
@@ -102,7 +103,7 @@ PARAMETERS: dict[str, Mapping[str, Field]] = {
         "thrifty_weight": Field("weight of the chance of failure", high=1, default=0.25),
         "thrifty_threshold": Field("normalised scores at or below this become 0", default=3.25),
     },
-    **{letters: {"idle_humans_teleoperate": _IDLE} for letters in ORDERS if "c" in letters},
+    **{letters: {"idle_humans_teleoperate": _IDLE} for letters in ORDERS_WITH_C},
 }
 
 
@@ -114,3 +115,14 @@ def every_field() -> dict[str, Field]:
 def owners(name: str) -> tuple[str, ...]:
     """Return the algorithms that have a parameter of this name."""
     return tuple(algorithm for algorithm, own in PARAMETERS.items() if name in own)
+
+
+def owners_in_words(name: str) -> str:
+    """Return the same as people read it.
+
+    >>> owners_in_words("random_threshold"), owners_in_words("idle_humans_teleoperate")
+    ('random', 'cur and other orders with c')
+    """
+    found = owners(name)
+    others = [algorithm for algorithm in found if algorithm not in ORDERS_WITH_C]
+    return ", ".join([*others, *(["cur and other orders with c"] if len(others) < len(found) else [])])

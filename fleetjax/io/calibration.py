@@ -56,6 +56,11 @@ class Calibration(NamedTuple):
     tried: list[tuple[float, float]]
 
 
+def default_field(config: Config) -> str:
+    """Return the threshold by which an algorithm asks for help: its own, if it has one."""
+    return next((name for name in config.parameters if name.endswith("_threshold")), "uncertainty_threshold")
+
+
 def check(request: Request) -> None:
     """Check what was asked for before anything is computed.
 
@@ -70,7 +75,7 @@ def check(request: Request) -> None:
     largest = request.config.num_humans * request.config.num_steps
     if not 0 < request.human_time < largest:
         raise ValueError(
-            f"human_time = {request.human_time:g} must lie between 0 and num_humans * num_steps = {largest}, all the time there is"
+            f"human_time = {request.human_time:g} must lie between 0 and {largest}, which is num_humans * num_steps"
         )
     for name, low in {"most": 1, "tolerance": 0}.items():
         if not getattr(request, name) >= low:
@@ -125,7 +130,7 @@ def _over_seeds(request: Request, value: float, others: list[int], tried: list[t
 
 
 def _slope(value: float, tried: list[tuple[float, float]], scale: Scale) -> float:
-    """Return the change of log human time with the scaled value, between it and the nearest other value; NaN if there is none."""
+    """Return the change of log human time per scaled value, from it to the nearest other value; NaN if there is none."""
     here = scale.inward(value)
     rest = [(scale.inward(other), spent) for other, spent in tried if other != value]
     if not rest:

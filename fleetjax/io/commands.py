@@ -12,11 +12,11 @@ import numpy as np
 
 from fleetjax import envs
 from fleetjax.checks import check_run
-from fleetjax.config import make_config
+from fleetjax.config import Config, make_config
 from fleetjax.console.controls import CONTROLS
 from fleetjax.envs import get_defaults, list_envs
-from fleetjax.field import every_field
-from fleetjax.io import chunks, export, files, flags, folder, formats, resumable, study, sweep, text
+from fleetjax.field import FIELDS, every_field, owners_in_words
+from fleetjax.io import calibration, chunks, export, files, flags, folder, formats, resumable, study, sweep, text
 from fleetjax.io.errors import Refusal
 from fleetjax.io.progress import progress, say
 from fleetjax.metrics import Metrics
@@ -66,15 +66,25 @@ def _new_run(arguments: argparse.Namespace, given: Mapping[str, Any]) -> folder.
     Raises:
         ValueError: if the configuration cannot be used.
     """
+    config, seed = _config(arguments, given), arguments.seed or 0
+    logged = arguments.command == "run" and arguments.log_interventions
+    return folder.Run(arguments.output or folder.default_folder(config, seed), config, seed, logged)
+
+
+def _config(arguments: argparse.Namespace, given: Mapping[str, Any]) -> Config:
+    """Return the configuration that was asked for.
+
+    Raises:
+        ValueError: if it cannot be used.
+    """
     if "environment" not in given:
         known = CONTROLS if arguments.command == "console" else list_envs()
         resume = ", or resume a run with --resume RUN" if arguments.command == "run" else ""
         raise ValueError(f"ENV is missing; choose one of {', '.join(known)}{resume}")
     overrides = {name: value for name, value in given.items() if name not in ("environment", "algorithm")}
-    config, seed = make_config(given["environment"], given.get("algorithm", "cur"), **overrides), arguments.seed or 0
+    config = make_config(given["environment"], given.get("algorithm", "cur"), **overrides)
     check_run(config)
-    logged = arguments.command == "run" and arguments.log_interventions
-    return folder.Run(arguments.output or folder.default_folder(config, seed), config, seed, logged)
+    return config
 
 
 def _run_to_resume(arguments: argparse.Namespace, given: Mapping[str, Any]) -> folder.Run:
@@ -113,6 +123,28 @@ def run_sweep(arguments: argparse.Namespace) -> None:
     sweep.run_all(asked, runs)
 
 
+def calibrate_field(arguments: argparse.Namespace) -> None:
+    """Find the value of a parameter at which an algorithm spends a given human time."""
+    given = _parameters(arguments)
+    with _refusing():
+        if arguments.human_time is None:
+            raise ValueError("--human-time is missing; say how many human timesteps a run should spend")
+        config = _config(arguments, given)
+        request = calibration.Request(
+            config,
+            arguments.field or calibration.default_field(config),
+            arguments.human_time,
+            tuple(range(arguments.first_seed, arguments.first_seed + arguments.seeds)),
+            arguments.tolerance,
+            arguments.most,
+            arguments.output or Path("runs") / f"calibrate-{config.environment}-{config.algorithm}",
+            arguments.checkpoint_every,
+        )
+        calibration.check(request)
+    found = calibration.calibrate(request)
+    print(calibration.report(request, found))
+
+
 def list_all(arguments: argparse.Namespace) -> None:
     """Show environments and algorithms."""
     del arguments
@@ -129,9 +161,9 @@ def list_all(arguments: argparse.Namespace) -> None:
     print("\nalgorithms")
     named = [name for name in list_algorithms() if not text.is_order(name) or name == "cur"]
     print(text.table([("", name, text.label(name), text.meaning(name)) for name in named]))
-    for name in list_algorithms():
-        for own, field in get_algorithm(name).parameters.items():
-            print(f"  {name}'s own parameter: {own} {flags.show(field.default)}, {field.help}")
+    for name, field in every_field().items():
+        if name not in FIELDS:
+            print(f"  own parameter of {owners_in_words(name)}: {name} {flags.show(field.default)}, {field.help}")
     print(f"  and {text.ORDERS}")
 
 
@@ -270,6 +302,7 @@ def replay(arguments: argparse.Namespace) -> None:
 COMMANDS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "run": run_fleet,
     "sweep": run_sweep,
+    "calibrate": calibrate_field,
     "list": list_all,
     "plot": plot_runs,
     "evaluate": evaluate_policy,

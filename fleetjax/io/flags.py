@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import Any, NoReturn
 
 from fleetjax.environments import get_defaults, list_envs
-from fleetjax.field import FIELDS, Field, every_field, owners
+from fleetjax.field import FIELDS, Field, every_field, owners_in_words
 from fleetjax.io.errors import Refusal
 from fleetjax.io.formats import FORMATS
 from fleetjax.io.lists import listed, sizes
@@ -27,6 +27,7 @@ Interactive fleet learning: N robots, M humans. Who should get help, and what do
   fleetjax run humanoid                 the paper's main experiment, C.U.R. with 100 humanoids
   fleetjax run humanoid --help          every parameter, with its meaning, unit and default
   fleetjax sweep navigation --seeds 5 --output DIR   many runs, in parallel
+  fleetjax calibrate navigation --human-time 10000   the threshold at which C.U.R. spends so much
   fleetjax plot runs/humanoid-*         runs in one figure; seeds become a mean and a band
   fleetjax evaluate RUN                 the trained policy on its own; nobody teleoperates
   fleetjax console navigation --humans 2   real people supervise, in their browsers"""
@@ -39,6 +40,10 @@ that was stopped, and a larger one extends it.
 
 Every parameter takes a list: --algorithm cur,random --num-humans 5,10 --hidden-sizes 64 64,256 256. A parameter of one
 algorithm is given to that algorithm alone. A FILE holds the same names with lists, in TOML; flags override it."""
+_CALIBRATE_ABOUT = """\
+Find the value of a parameter at which an algorithm spends a given human time, by a few runs with the first seed, and confirm it
+with the others. Thresholds do not carry over between robots, policies or sizes of a run. The runs are kept below DIR, so the
+same command resumes, and a finished one answers at once."""
 _RUN_NOTE = """\
 Some algorithms change defaults: expert has as many humans as robots; constraint gets as many extra demonstrations as C.U.R.
 uses human timesteps; constraint_trained also takes as many gradient steps before the start as the others take in total."""
@@ -101,6 +106,7 @@ def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands")
     _add_run(commands, environment)
     _add_sweep(commands, environment)
+    _add_calibrate(commands, environment)
     commands.add_parser("list", help="show environments and algorithms")
 
     plot = commands.add_parser("plot", help="draw runs in one figure; seeds become a mean and a band")
@@ -193,6 +199,26 @@ def _add_sweep(commands: Any, environment: str | None) -> None:
     _add_parameters(sweep, environment, with_lists=True)
 
 
+def _add_calibrate(commands: Any, environment: str | None) -> None:
+    usage = "fleetjax calibrate ENV --human-time X [--field NAME] [--algorithm A] [--seeds N] [parameters]"
+    calibrate = commands.add_parser(
+        "calibrate", help="find the threshold that spends a given human time", usage=usage, description=_CALIBRATE_ABOUT
+    )
+    calibrate.add_argument("environment", metavar="ENV", nargs="?", default=argparse.SUPPRESS, help="environment")
+    wanted = "human timesteps that a run should spend, hard resets included"
+    calibrate.add_argument("--human-time", metavar="X", type=_number, help=wanted)
+    calibrate.add_argument("--field", metavar="NAME", help="parameter to find [default: the algorithm's threshold]")
+    calibrate.add_argument("--first-seed", metavar="N", type=_seed, default=0, help="seed of the search [default: 0]")
+    calibrate.add_argument("--seeds", metavar="N", type=_integer, default=3, help="seeds in all [default: 3]")
+    near = "relative difference that is near enough [default: 0.05]"
+    calibrate.add_argument("--tolerance", metavar="X", type=_number, default=0.05, help=near)
+    calibrate.add_argument("--most", metavar="N", type=_integer, default=10, help="runs of the search at most [default: 10]")
+    calibrate.add_argument("--output", metavar="DIR", type=Path, help="folder of its runs [default: below runs/]")
+    every = "timesteps between the checkpoints of a run; 0 = none [default: 1000]"
+    calibrate.add_argument("--checkpoint-every", metavar="N", type=_integer, default=1000, help=every)
+    _add_parameters(calibrate, environment)
+
+
 def _add_console(commands: Any, environment: str | None) -> None:
     usage = "fleetjax console ENV --humans M [--host HOST --token TOKEN] [--port N] [--output DIR] [parameters]"
     console = commands.add_parser(
@@ -238,7 +264,7 @@ def _add_parameters(
         if name in FIELDS and name != "environment":
             add(fields, name, field, environment, *([short[name]] if name in short else []))
         elif name not in FIELDS:
-            add(own, name, field._replace(help=f"{', '.join(owners(name))}: {field.help}"), environment)
+            add(own, name, field._replace(help=f"{owners_in_words(name)}: {field.help}"), environment)
 
 
 def _add_field(group: Any, name: str, field: Field, environment: str | None, *short: str) -> None:

@@ -89,7 +89,7 @@ CASES = {
     ),
     "experiments/clone_error.py": Case(
         ("humanoid --demonstrations 256 --fresh 100 --gradient-steps 2",),
-        (row("256", *[r"\d\.\d{4}"] * 3), r"^variance of the expert's actions: 0\.\d+", r"^error of repeating .*: 0\.\d+"),
+        (row("observation", "256", *[r"\d\.\d{4}"] * 3, r"\d+"), r"variance of the expert's actions \| +\| 0\.\d+"),
         quick=True,
     ),
     "experiments/first_look.py": Case(

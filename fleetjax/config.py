@@ -39,14 +39,15 @@ class Config(Fields):
             ValueError: if a field is unknown, a parameter is another algorithm's, an integer field gets a value that is not an
                 integer, or the number of demonstrations is traced and no `human_capacity` says how many pairs there may be.
         """
-        known = all_fields(changes.get("algorithm", self.algorithm))
+        algorithm = changes.get("algorithm", self.algorithm)
+        known = all_fields(algorithm)
         for name in changes:
             if name not in known:
-                raise ValueError(_not_known(name, changes.get("algorithm", self.algorithm)))
+                raise ValueError(_not_known(name, algorithm))
         typed = {name: _typed(name, known[name], value) for name, value in changes.items()}
         own = self.parameters
-        if not own or changes.get("algorithm", self.algorithm) != self.algorithm:
-            own = _default_parameters(changes.get("environment", self.environment), changes["algorithm"])
+        if not own or algorithm != self.algorithm:
+            own = _default_parameters(changes.get("environment", self.environment), algorithm)
         own = {**own, **{name: typed.pop(name) for name in list(typed) if name not in FIELDS}}
         return _with_capacity(self, dataclasses.replace(self, **typed, parameters=own), changes)
 

@@ -1,4 +1,4 @@
-"""The command line: `fleetjax run`, `list`, `plot`, `evaluate`, `export`, `render`, `console` and `replay`.
+"""The command line: `fleetjax run`, `list`, `plot`, `compare`, `evaluate`, `export`, `render`, `console` and `replay`.
 
 What cannot be used is refused with one line on stderr and exit code 2, before anything is computed.
 """

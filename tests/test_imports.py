@@ -60,8 +60,10 @@ def test_public_names_are_there_in_a_fresh_process():
     assert run_fresh("import sys, fleetjax; print('jax' in sys.modules, callable(fleetjax.run), 'run' in dir(fleetjax))") == (
         "False True True\n"
     )
-    program = "import fleetjax.io.commands, fleetjax; from fleetjax import *; "
+    program = (
+        "import fleetjax.io.commands, fleetjax; from fleetjax import *; "
         "print(run is fleetjax.run, callable(run), envs.__name__)"
+    )
     assert run_fresh(program) == "True True fleetjax.envs\n"
 
 

@@ -26,6 +26,7 @@ Interactive fleet learning: N robots, M humans. Who should get help, and what do
   fleetjax run humanoid                 the paper's main experiment, C.U.R. with 100 humanoids
   fleetjax run humanoid --help          every parameter, with its meaning, unit and default
   fleetjax plot runs/humanoid-*         runs in one figure; seeds become a mean and a band
+  fleetjax compare runs --against cur   tables of runs: means, intervals, differences
   fleetjax evaluate RUN                 the trained policy on its own; nobody teleoperates
   fleetjax console navigation --humans 2   real people supervise, in their browsers"""
 _RUN_ABOUT = """\
@@ -61,6 +62,9 @@ class _Parser(argparse.ArgumentParser):
         return f"unknown flag {flag}; the closest is {close[0]}"
 
 
+_COMPARE_ABOUT = """Compare runs over their seeds. Runs that differ in nothing but their seed are one group. Prints a table for
+each environment and metric: means with 95 % intervals, interquartile means and human time, and with --against how each
+group differs from one. docs/comparing.md explains the numbers."""
 _EXPORT_ABOUT = """Write what teleoperating humans saw and did as a data set for other tools, one episode per intervention. The
 run must have been made with --log-interventions."""
 _RENDER_ABOUT = """Draw robots as an animation, a grid of tiles. Teleoperated robots are tinted blue, robots in violation red.
@@ -101,6 +105,7 @@ def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser
     )
     plot.add_argument("--overwrite", action="store_true", help="replace an existing file")
 
+    _add_compare(commands)
     evaluate = commands.add_parser("evaluate", help="run a trained policy without teleoperation")
     evaluate.add_argument("run", metavar="RUN", type=Path, help="run folder")
     evaluate.add_argument("--num-steps", metavar="N", type=_integer, default=10_000, help="timesteps [default: 10000]")
@@ -138,6 +143,37 @@ def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser
     replay = commands.add_parser("replay", help="repeat a console session from its record, and compare every bit")
     replay.add_argument("run", metavar="RUN", type=Path, help="run folder of a console session")
     return parser, list(commands.choices)
+
+
+def _add_compare(commands: Any) -> None:
+    usage = "fleetjax compare DIR... [--against GROUP] [--metric NAME]... [--output FILE]... [--rows FILE.csv]"
+    about = {"help": "compare runs in tables: means, intervals, differences", "description": _COMPARE_ABOUT}
+    compare = commands.add_parser("compare", usage=usage, **about)
+    runs = "run folder, folder that holds run folders, or file that --rows wrote"
+    compare.add_argument("runs", metavar="DIR", nargs="+", type=Path, help=runs)
+    compare.add_argument("--against", metavar="GROUP", help="group to compare with: an algorithm, or a name in the table")
+    compare.add_argument(
+        "--metric",
+        metavar="NAME",
+        action="append",
+        help="column of metrics.csv (its total counts), rohe, or rohe_with_demonstrations, for which extra demonstrations "
+        "count as human time; may be repeated [default: successes, violations, idle and rohe]",
+    )
+    compare.add_argument(
+        "--output",
+        metavar="FILE",
+        action="append",
+        type=Path,
+        default=[],
+        help="table (md, csv) or figure (png, pdf, svg); may be repeated [default: print the table]",
+    )
+    compare.add_argument(
+        "--rows", metavar="FILE.csv", type=Path, help="also store a row for each run, from which compare can start again"
+    )
+    compare.add_argument(
+        "--allow-different", action="store_true", help="compare runs of different length or size, and interrupted ones"
+    )
+    compare.add_argument("--overwrite", action="store_true", help="replace existing files")
 
 
 def _add_run(commands: Any, environment: str | None) -> None:

@@ -158,10 +158,11 @@ def compare_runs(arguments: argparse.Namespace) -> None:
         if arguments.rows:
             files.check_ending(arguments.rows, (rows.SUFFIX,), flag="--rows")
         found = sources.collect(arguments.runs)
-        metrics, different = arguments.metric or comparing.METRICS, arguments.allow_different
-        compared = comparing.compare(found, arguments.against, metrics, allow_different=different)
     outputs = [*arguments.output, *([arguments.rows] if arguments.rows else [])]
     targets = [files.check_free(path, overwrite=arguments.overwrite) for path in outputs]
+    with _refusing():
+        metrics, different = arguments.metric or comparing.METRICS, arguments.allow_different
+        compared = comparing.compare(found, arguments.against, metrics, allow_different=different)
     _say_skipped(found)
     if not arguments.output:
         print(compared.markdown(), end="")

@@ -11,14 +11,14 @@ from fleetjax.io import text
 from fleetjax.statistics import MIN_SEEDS
 
 _NOTES = f"""\
-mean: over seeds. 95 % interval: of the mean, BCa bootstrap over seeds. range: smallest to largest, in
-place of an interval where there are fewer than {MIN_SEEDS} seeds. IQM: interquartile mean, the mean of the
-middle half of the seeds. human time: mean number of human timesteps in a run."""
+mean: over seeds. 95 % interval: of the mean, BCa bootstrap over seeds. range: smallest to largest,
+in place of an interval where there are fewer than {MIN_SEEDS} seeds. IQM: interquartile mean, the mean of
+the middle half of the seeds. human time: mean number of human timesteps in a run."""
 _NOTES_ON_DIFFERENCES = """\
-pairs: seeds that both groups have; the difference is the mean over them, or with 0 pairs the
-difference between the means. P(higher): probability that a run of the group has a higher value than a
-run of the other, ties counting half; the probability of improvement where more is better. p: of the
-two-sided Mann-Whitney test."""
+pairs: seeds that both groups have. The difference is the mean over them; with 0 pairs, it is the
+difference between the means. P(higher): probability that a run of the group has a higher value than
+a run of the other, ties counting half: the probability of improvement where more is better.
+p: of the two-sided Mann-Whitney test."""
 
 
 class Comparison(NamedTuple):

@@ -90,9 +90,9 @@ def read(path: Path) -> list[Outcome]:
     table = csv.DictReader(io.StringIO(content, newline=""), strict=True)
     runs: list[Outcome] = []
     make = functools.cache(lambda fields: make_config(**json.loads(fields)))  # once for all seeds
+    missing = set(_COLUMNS) - set(Metrics._fields) - set(table.fieldnames or ())
+    expect(not missing, f"{path} is not a file of rows: it has no columns {', '.join(sorted(missing))}")
     try:
-        missing = set(_COLUMNS) - set(Metrics._fields) - set(table.fieldnames or ())
-        expect(not missing, f"it has no columns {', '.join(sorted(missing))}, so it is not a file of rows")
         for row in table:
             expect(None not in row and None not in row.values(), "its number of cells is not that of the columns")
             runs.append(_outcome(row, make, f"{path}, row {len(runs) + 1}"))

@@ -18,6 +18,7 @@ from fleetjax.version import VERSION
 
 _LARGEST_SEED = 2**32 - 1  # JAX folds larger ones onto these
 _LARGEST = 2**31 - 1
+_RUNS = "run folder, folder that holds run folders, or file that `fleetjax compare --rows` wrote"
 PORT = 8765  # that a console serves
 _ABOUT = """\
 Interactive fleet learning: N robots, M humans. Who should get help, and what does the fleet gain?
@@ -99,7 +100,7 @@ def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser
     commands.add_parser("list", help="show environments and algorithms")
 
     plot = commands.add_parser("plot", help="draw runs in one figure; seeds become a mean and a band")
-    plot.add_argument("runs", metavar="RUN", nargs="+", type=Path, help="run folder")
+    plot.add_argument("runs", metavar="RUN", nargs="+", type=Path, help=_RUNS)
     plot.add_argument(
         "--output", metavar="FILE", type=Path, default=Path("fleetjax.png"), help="png, pdf or svg [default: fleetjax.png]"
     )
@@ -149,8 +150,7 @@ def _add_compare(commands: Any) -> None:
     usage = "fleetjax compare DIR... [--against GROUP] [--metric NAME]... [--output FILE]... [--rows FILE.csv]"
     about = {"help": "compare runs in tables: means, intervals, differences", "description": _COMPARE_ABOUT}
     compare = commands.add_parser("compare", usage=usage, **about)
-    runs = "run folder, folder that holds run folders, or file that --rows wrote"
-    compare.add_argument("runs", metavar="DIR", nargs="+", type=Path, help=runs)
+    compare.add_argument("runs", metavar="DIR", nargs="+", type=Path, help=_RUNS)
     compare.add_argument("--against", metavar="GROUP", help="group to compare with: an algorithm, or a name in the table")
     compare.add_argument(
         "--metric",

@@ -1,4 +1,4 @@
-"""The command line: `fleetjax run`, `sweep`, `list`, `plot`, `evaluate`, `export`, `render`, `console` and `replay`.
+"""The command line: `fleetjax run`, `sweep`, `calibrate`, `list`, `plot`, `compare`, `evaluate`, `export`, `render`, and so on.
 
 What cannot be used is refused with one line on stderr and exit code 2, before anything is computed.
 """

@@ -3,7 +3,7 @@
 import argparse
 import contextlib
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,21 @@ from fleetjax.config import Config, make_config
 from fleetjax.console.controls import CONTROLS
 from fleetjax.envs import get_defaults, list_envs
 from fleetjax.field import FIELDS, every_field, owners_in_words
-from fleetjax.io import calibration, chunks, export, files, flags, folder, formats, resumable, study, sweep, text
+from fleetjax.io import (
+    calibration,
+    chunks,
+    export,
+    files,
+    flags,
+    folder,
+    formats,
+    outcomes,
+    resumable,
+    sources,
+    study,
+    sweep,
+    text,
+)
 from fleetjax.io.errors import Refusal
 from fleetjax.io.progress import progress, say
 from fleetjax.metrics import Metrics
@@ -172,20 +186,51 @@ def plot_runs(arguments: argparse.Namespace) -> None:
     from fleetjax.io import figure  # matplotlib takes a while to import
 
     with _refusing():
-        figure.check_format(arguments.output)
-        runs = [folder.read_run(path) for path in arguments.runs]
-        data = [(run.config, run.seed, folder.read_metrics(run)) for run in runs]
+        files.check_ending(arguments.output, figure.FORMATS)
+        found = sources.collect(arguments.runs)
     output = files.check_free(arguments.output, overwrite=arguments.overwrite)
-    groups = figure.group(data)
-    for run, (_, _, metrics) in zip(runs, data, strict=True):
-        if len(metrics.successes) < run.config.num_steps:
-            say(f"{run.folder} was interrupted; curves with the same settings end at {len(metrics.successes)} timesteps")
-    skipped = len(data) - sum(len(curves.values) for curves in groups)
+    for run in found:
+        if run.timesteps[-1] < run.config.num_steps:
+            say(f"{run.name} was interrupted; curves with the same settings end at {run.timesteps[-1]} timesteps")
+    _say_skipped(found)
+    files.write(output, figure.render(figure.plot(found), arguments.output.suffix))
+    print(arguments.output)
+
+
+def _say_skipped(found: Sequence[outcomes.Outcome]) -> None:
+    skipped = len(found) - sum(len(group.runs) for group in outcomes.group(found))
     if skipped:
         say(f"skipped {text.plural(skipped, 'run')} with the same settings and seed as a later one")
-    drawn = figure.draw(groups)
-    files.write(output, figure.render(drawn, arguments.output.suffix))
-    print(arguments.output)
+
+
+def compare_runs(arguments: argparse.Namespace) -> None:
+    """Compare runs over their seeds: print or write tables, draw figures, store rows."""
+    from fleetjax.io import comparing, figure, rows
+
+    with _refusing():
+        for path in arguments.output:
+            files.check_ending(path, (".md", ".csv", *figure.FORMATS))
+        if arguments.rows:
+            files.check_ending(arguments.rows, (rows.SUFFIX,), flag="--rows")
+        found = sources.collect(arguments.runs)
+    outputs = [*arguments.output, *([arguments.rows] if arguments.rows else [])]
+    targets = [files.check_free(path, overwrite=arguments.overwrite) for path in outputs]
+    with _refusing():
+        metrics, different = arguments.metric or comparing.METRICS, arguments.allow_different
+        compared = comparing.compare(found, arguments.against, metrics, allow_different=different)
+    _say_skipped(found)
+    if not arguments.output:
+        print(compared.markdown(), end="")
+    for path, target in zip(arguments.output, targets, strict=False):
+        if path.suffix in figure.FORMATS:
+            content = figure.render(figure.plot(found), path.suffix)
+        else:
+            content = (compared.csv() if path.suffix == ".csv" else compared.markdown()).encode()
+        files.write(target, content)
+        print(path)
+    if arguments.rows:
+        files.write(targets[-1], rows.write(found))
+        say(f"{arguments.rows}: {text.plural(len(found), 'row')}")
 
 
 def evaluate_policy(arguments: argparse.Namespace) -> None:
@@ -305,6 +350,7 @@ COMMANDS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "calibrate": calibrate_field,
     "list": list_all,
     "plot": plot_runs,
+    "compare": compare_runs,
     "evaluate": evaluate_policy,
     "export": export_interventions,
     "render": render_robots,

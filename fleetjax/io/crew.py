@@ -86,7 +86,7 @@ class Crew:
         return [one.run for one in self._workers if one.run]
 
     def wait(self) -> list[tuple[Run, str]]:
-        """Wait a little; return the runs that ended meanwhile, without those that were stopped, each with "" or why it failed."""
+        """Wait a little; return the runs that ended meanwhile, but for those that were stopped, with "" or why they failed."""
         working: dict[Any, _Worker] = {one.pipe: one for one in self._workers if one.run}
         ended = []
         for pipe in wait(list(working), _POLL):

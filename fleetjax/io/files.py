@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,16 @@ def check_place(path: Path) -> None:
             pass
     except OSError as error:
         raise OSError(f"{path} cannot be written: {error.strerror}") from None
+
+
+def check_ending(path: Path, endings: Sequence[str], flag: str = "--output") -> None:
+    """Check that a file has one of the endings that are known.
+
+    Raises:
+        ValueError: if it has not.
+    """
+    if path.suffix not in endings:
+        raise ValueError(f"{flag} {path} must end in {'one of ' * (len(endings) > 1)}{', '.join(endings)}")
 
 
 def check_free(path: Path, *, overwrite: bool, is_folder: bool = False) -> Path:

@@ -19,6 +19,7 @@ from fleetjax.version import VERSION
 
 _LARGEST_SEED = 2**32 - 1  # JAX folds larger ones onto these
 _LARGEST = 2**31 - 1
+_RUNS = "run folder, folder that holds run folders, or file that `fleetjax compare --rows` wrote"
 PORT = 8765  # that a console serves
 _ABOUT = """\
 Interactive fleet learning: N robots, M humans. Who should get help, and what does the fleet gain?
@@ -29,6 +30,7 @@ Interactive fleet learning: N robots, M humans. Who should get help, and what do
   fleetjax sweep navigation --seeds 5 --output DIR   many runs, in parallel
   fleetjax calibrate navigation --human-time 10000   the threshold at which C.U.R. spends so much
   fleetjax plot runs/humanoid-*         runs in one figure; seeds become a mean and a band
+  fleetjax compare runs --against cur   tables of runs: means, intervals, differences
   fleetjax evaluate RUN                 the trained policy on its own; nobody teleoperates
   fleetjax console navigation --humans 2   real people supervise, in their browsers"""
 _RUN_ABOUT = """\
@@ -74,6 +76,9 @@ class _Parser(argparse.ArgumentParser):
         return f"unknown flag {flag}; the closest is {close[0]}"
 
 
+_COMPARE_ABOUT = """Compare runs over their seeds. Runs that differ in nothing but their seed are one group. Prints a table for
+each environment and metric: means with 95 % intervals, interquartile means and human time, and with --against how each
+group differs from one. docs/comparing.md explains the numbers."""
 _EXPORT_ABOUT = """Write what teleoperating humans saw and did as a data set for other tools, one episode per intervention. The
 run must have been made with --log-interventions."""
 _RENDER_ABOUT = """Draw robots as an animation, a grid of tiles. Teleoperated robots are tinted blue, robots in violation red.
@@ -110,12 +115,13 @@ def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser
     commands.add_parser("list", help="show environments and algorithms")
 
     plot = commands.add_parser("plot", help="draw runs in one figure; seeds become a mean and a band")
-    plot.add_argument("runs", metavar="RUN", nargs="+", type=Path, help="run folder")
+    plot.add_argument("runs", metavar="RUN", nargs="+", type=Path, help=_RUNS)
     plot.add_argument(
         "--output", metavar="FILE", type=Path, default=Path("fleetjax.png"), help="png, pdf or svg [default: fleetjax.png]"
     )
     plot.add_argument("--overwrite", action="store_true", help="replace an existing file")
 
+    _add_compare(commands)
     evaluate = commands.add_parser("evaluate", help="run a trained policy without teleoperation")
     evaluate.add_argument("run", metavar="RUN", type=Path, help="run folder")
     evaluate.add_argument("--num-steps", metavar="N", type=_integer, default=10_000, help="timesteps [default: 10000]")
@@ -153,6 +159,36 @@ def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser
     replay = commands.add_parser("replay", help="repeat a console session from its record, and compare every bit")
     replay.add_argument("run", metavar="RUN", type=Path, help="run folder of a console session")
     return parser, list(commands.choices)
+
+
+def _add_compare(commands: Any) -> None:
+    usage = "fleetjax compare DIR... [--against GROUP] [--metric NAME]... [--output FILE]... [--rows FILE.csv]"
+    about = {"help": "compare runs in tables: means, intervals, differences", "description": _COMPARE_ABOUT}
+    compare = commands.add_parser("compare", usage=usage, **about)
+    compare.add_argument("runs", metavar="DIR", nargs="+", type=Path, help=_RUNS)
+    compare.add_argument("--against", metavar="GROUP", help="group to compare with: an algorithm, or a name in the table")
+    compare.add_argument(
+        "--metric",
+        metavar="NAME",
+        action="append",
+        help="column of metrics.csv (its total counts), rohe, or rohe_with_demonstrations, for which extra demonstrations "
+        "count as human time; may be repeated [default: successes, violations, idle and rohe]",
+    )
+    compare.add_argument(
+        "--output",
+        metavar="FILE",
+        action="append",
+        type=Path,
+        default=[],
+        help="table (md, csv) or figure (png, pdf, svg); may be repeated [default: print the table]",
+    )
+    compare.add_argument(
+        "--rows", metavar="FILE.csv", type=Path, help="also store a row for each run, from which compare can start again"
+    )
+    compare.add_argument(
+        "--allow-different", action="store_true", help="compare runs of different length or size, and interrupted ones"
+    )
+    compare.add_argument("--overwrite", action="store_true", help="replace existing files")
 
 
 def _add_run(commands: Any, environment: str | None) -> None:

@@ -215,7 +215,7 @@ def seal(run: folder.Run, metrics: Metrics) -> None:
     """Draw what there is, and store the SHA-256 of all files."""
     from fleetjax.io import figure  # matplotlib takes a while to import
 
-    drawn = figure.draw(figure.group([(run.config, run.seed, metrics)]), text.headline(run.config, run.seed))
+    drawn = figure.plot([(run.config, run.seed, metrics)], text.headline(run.config, run.seed))
     files.write(run.folder / folder.FIGURE, figure.render(drawn))
     folder.write_config(run, sealed=True)
 

@@ -115,6 +115,22 @@ def table(rows: Iterable[Sequence[str]], *, right: Sequence[int] = ()) -> str:
     return "\n".join(map(line, rows))
 
 
+def markdown_table(rows: Iterable[Sequence[str]]) -> str:
+    """Return rows, the first of which is the head, as a Markdown table; all columns but the first are aligned to the right.
+
+    >>> print(markdown_table([("group", "seeds"), ("C.U.R.", "5")]))
+    | group  | seeds |
+    |--------|------:|
+    | C.U.R. |     5 |
+    """
+    rows = [tuple(row) for row in rows]
+    first, *widths = (max(map(len, column)) for column in zip(*rows, strict=True))
+    lines = [[row[0].ljust(first), *(cell.rjust(w) for cell, w in zip(row[1:], widths, strict=True))] for row in rows]
+    head, *body = (f"| {' | '.join(line)} |" for line in lines)
+    rule = "|".join(["-" * (first + 2), *("-" * (w + 1) + ":" for w in widths)])
+    return "\n".join([head, f"|{rule}|", *body])
+
+
 def headline(config: Config, seed: int) -> str:
     """Return what is run, in one line."""
     return (

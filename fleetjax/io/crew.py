@@ -86,7 +86,7 @@ class Crew:
         return [one.run for one in self._workers if one.run]
 
     def wait(self) -> list[tuple[Run, str]]:
-        """Wait a little; return the runs that ended meanwhile, but for those that were stopped, with "" or why they failed."""
+        """Wait a little; return the runs that ended meanwhile, each with "" or why it failed; not those that were stopped."""
         working: dict[Any, _Worker] = {one.pipe: one for one in self._workers if one.run}
         ended = []
         for pipe in wait(list(working), _POLL):
@@ -150,7 +150,7 @@ def choose(waiting: Sequence[Run], compiled: Any, others: Sequence[Any]) -> Run:
 
     def rank(run: Run) -> tuple[bool, int, int]:
         own = program(run)
-        return own != compiled, others.count(own), -left[own]
+        return compiled is None or own != compiled, others.count(own), -left[own]
 
     return min(waiting, key=rank)
 

@@ -122,9 +122,8 @@ def _block(values: Mapping[str, Any]) -> Block:
     expect(not {"seed", "seeds"} <= values.keys(), "seed and seeds contradict each other; omit one")
     if "seeds" in values:
         number = values["seeds"]
-        expect(
-            type(number) is int and 1 <= number <= _MOST_SEEDS, f"seeds = {number!r} must be a number from 1 to {_MOST_SEEDS}"
-        )
+        sound = type(number) is int and 1 <= number <= _MOST_SEEDS
+        expect(sound, f"seeds = {number!r} must be a whole number from 1 to {_MOST_SEEDS}")
         lists["seed"] = list(range(number))
     if "seed" in values:
         lists["seed"] = values["seed"] if isinstance(values["seed"], list) else [values["seed"]]

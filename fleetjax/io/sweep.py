@@ -75,7 +75,7 @@ def run_all(study: Study, runs: Sequence[folder.Run]) -> None:
             finished = sum(map(_is_finished, runs))
             raise KeyboardInterrupt(f"with {finished} of {all_runs} finished; repeat the command to resume") from None
     if failed:
-        raise Incomplete(f"{failed} of {all_runs} failed; repeat the command to try again, but first delete what is damaged")
+        raise Incomplete(f"{failed} of {all_runs} failed; repeat the command to try again; delete a damaged run folder first")
     print(f"{all_runs} finished, {text.duration(time.monotonic() - begun)} in all. Folder: {study.output}")
 
 

@@ -55,6 +55,17 @@ def make_runs(place: Path) -> None:
         write_run(place / f"run-{seed}", config, seed, make_metrics(seed, 40))
 
 
+TINY_STUDY = """
+environment = ["navigation"]
+algorithm = ["expert", "constraint"]
+num_robots = 2
+num_humans = 2
+num_steps = 6
+num_demonstrations = 128
+pretraining_steps = 2
+hidden_sizes = [8]
+"""
+
 CASES = {
     "benchmarks/console.py": Case(("--pages 3 --ticks 10 --robots 4",), (row("3", r"\d+", r"[\d.]+", r"[\d.]+"),)),
     "benchmarks/fleet_step.py": Case(
@@ -85,6 +96,12 @@ CASES = {
         ("humanoid --demonstrations 256 --fresh 100 --gradient-steps 2",),
         (row("observation", "256", *[r"\d\.\d{4}"] * 3, r"\d+"), r"variance of the expert's actions \| +\| 0\.\d+"),
         quick=True,
+    ),
+    "experiments/paper.py": Case(
+        ("tiny --studies . --workers 1 --output runs --results rows", "tiny --studies . --results rows --rows-only"),
+        (r"^rows/tiny\.md$", r"^rows/tiny\.png$"),
+        ("rows/tiny.csv", "rows/tiny.md", "rows/tiny.png", "runs/tiny/sweep.json"),
+        lambda place: (place / "tiny.toml").write_text(TINY_STUDY) and None,
     ),
     "experiments/first_look.py": Case(
         (

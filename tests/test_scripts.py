@@ -87,6 +87,10 @@ CASES = {
     "benchmarks/startup.py": Case(
         (f"--environments navigation --run-steps 4 -- {FLEET}",), (row("navigation", *[r"\d+\.\d+"] * 4),)
     ),
+    "benchmarks/sweep.py": Case(
+        (f"--seeds 2 -- {FLEET} --algorithm constraint --extra-demonstrations 0 --num-steps 4",),
+        (row("1", r"\d+", r"[\d.]+", r"[\d.]+", "1.00"), row(r"\d+", "1", r"[\d.]+", r"[\d.]+", r"[\d.]+")),
+    ),
     "experiments/block_push.py": Case(
         (f"--algorithms constraint --seeds 0 -- {FLEET} --num-steps 4 --augmented-copies 1 --extra-demonstrations 0",),
         (r"^## block_push$", row("Constraint", "1", r"[\d.]+", "-"), r"^runs/block_push/block_push\.png$"),

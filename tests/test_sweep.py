@@ -147,6 +147,12 @@ def test_a_file_may_have_parts_with_the_top_as_their_defaults(tmp_path):
     assert [run.config.num_robots for run in runs.values()] == [20, 20, 20, 20, 4]
 
 
+def test_the_study_of_the_documentation_is_one(tmp_path):
+    page = (Path(__file__).parents[1] / "docs" / "sweeps.md").read_text()
+    runs = planned(write(tmp_path / "study.toml", page.split("```toml\n")[1].split("```")[0]))
+    assert len(runs) == 2 * 5 * (2 * 2 + 1)
+
+
 NAV = "navigation"
 BAD = {
     "M > N": (
@@ -220,8 +226,10 @@ def test_a_sweep_needs_an_environment_and_a_folder_of_its_own(capsys, tmp_path):
         capsys, "sweep", "navigation", "--output", tmp_path / "precious"
     )
     (tmp_path / "out").mkdir()
-    (tmp_path / "out" / sweep.FILE).write_text("{}")
-    assert f"{tmp_path / 'out' / sweep.FILE} is damaged" in refused(capsys, "sweep", "navigation", "--output", tmp_path / "out")
+    for damaged in ("", "{}", "[]", '{"runs": [4], "log_interventions": false}'):
+        (tmp_path / "out" / sweep.FILE).write_text(damaged)
+        said = refused(capsys, "sweep", "navigation", "--output", tmp_path / "out")
+        assert f"{tmp_path / 'out' / sweep.FILE} cannot be used: " in said
 
 
 # Who does what
@@ -325,6 +333,14 @@ def is_alive(process: int) -> bool:
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:
         return False
+
+
+def wait_for_end(processes: list[int]) -> None:
+    for _ in range(100_000):  # only not to hang: it takes a moment
+        if not any(map(is_alive, processes)):
+            return
+        time.sleep(1e-3)
+    raise AssertionError(f"{processes} still run")
 
 
 @pytest.fixture(scope="module")
@@ -449,8 +465,7 @@ def test_kills_of_workers_and_of_all_lose_nothing(tmp_path, spawn, whole):
         assert {owner(the_run(output, 0)), owner(the_run(output, 1))} <= set(workers)
         process.kill()
         process.communicate()
-        while any(map(is_alive, workers)):
-            time.sleep(1e-3)
+        wait_for_end(workers)
         assert 500 < rows(the_run(output, 0)) < STEPS
 
         process = spawn(*command)
@@ -470,10 +485,10 @@ def test_kills_of_workers_and_of_all_lose_nothing(tmp_path, spawn, whole):
         assert "resuming from" in (output / "logs" / f"navigation-random-seed{seed}.log").read_text()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_stopped_sweep_writes_checkpoints_and_resumes(tmp_path, spawn, whole, number):
+@pytest.mark.parametrize(("number", "together"), [(signal.SIGINT, 2), (signal.SIGTERM, 1)])
+def test_a_stopped_sweep_writes_checkpoints_and_resumes(tmp_path, spawn, whole, number, together):
     output = tmp_path / "out"
-    command = ("sweep", "navigation", *RANDOM, "--seeds", 3, "--workers", 2, "--checkpoint-every", 0, "--output", output)
+    command = ("sweep", "navigation", *RANDOM, "--seeds", 3, "--workers", together, "--checkpoint-every", 0, "--output", output)
     process = spawn(*command)
     with contextlib.ExitStack() as stack:
         stack.callback(process.kill)
@@ -485,9 +500,9 @@ def test_a_stopped_sweep_writes_checkpoints_and_resumes(tmp_path, spawn, whole, 
             process.send_signal(number)
         code, out, said = end(process)
     assert (code, out) == (130, "")
-    assert re.fullmatch("fleetjax: interrupted with [01] of 3 runs finished; repeat the command to resume", said[-1])
+    assert re.fullmatch("fleetjax: interrupted with [0-2] of 3 runs finished; repeat the command to resume", said[-1])
     assert not any(map(is_alive, workers))
-    assert not the_run(output, 2).exists()
+    assert the_run(output, 1).exists() == (together == 2)
     assert 300 < rows(the_run(output, 0)) < STEPS
     assert list(the_run(output, 0).glob("checkpoints/*/manifest.json"))
     code, _, said = end(spawn(*command))

@@ -225,7 +225,7 @@ def read_finished(run: Run) -> Metrics | None:
         if run.logged:
             read_interventions(run)
     except ValueError as error:
-        raise ValueError(f"{error}; start it again with --overwrite") from None
+        raise ValueError(f"{error}; delete the folder, or start it again with --overwrite") from None
     return metrics
 
 

@@ -162,7 +162,7 @@ def _resume(run: folder.Run) -> Start | None:
         say(f"skipped checkpoint {reason}")
     if found is None:
         if checkpoint.is_any_finished(run.folder):
-            raise Refusal(f"{run.folder} has no checkpoint that can be used; start it again with --overwrite")
+            raise Refusal(f"{run.folder} has no checkpoint that can be used; delete it, or start it again with --overwrite")
         say("no checkpoint was written yet; starting from t = 0")
         return None
     say(f"resuming from {found.path}")

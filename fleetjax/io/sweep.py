@@ -31,7 +31,7 @@ def check_folder(study: Study, runs: Sequence[folder.Run]) -> None:
         files.expect(free, f"{path} exists already and is not the folder of a sweep; choose another --output")
         return
     here = {run.folder: run for run in runs}
-    for run in plan(_read(study)):
+    for run in _read(study):
         files.expect(
             run.folder in here,
             f"{path} holds another sweep, with a run {run.folder.name} that this one lacks; choose another --output",
@@ -40,18 +40,18 @@ def check_folder(study: Study, runs: Sequence[folder.Run]) -> None:
         files.expect(not difference, f"{run.folder.name}: {difference} in {path}; choose another --output")
 
 
-def _read(study: Study) -> Study:
-    """Return the sweep that the folder holds.
+def _read(study: Study) -> list[folder.Run]:
+    """Return the runs of the sweep that the folder holds.
 
     Raises:
-        ValueError: if its description is damaged.
+        ValueError: if what says so is damaged.
     """
     path = study.output / FILE
     try:
         content = json.loads(path.read_bytes())
-        return study._replace(blocks=tuple(content["runs"]), logged=content["log_interventions"])
-    except (ValueError, TypeError, KeyError) as error:
-        raise ValueError(f"{path} is damaged ({files.one_line(error)}); choose another --output") from None
+        return plan(study._replace(blocks=tuple(content["runs"]), logged=content["log_interventions"]))
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise ValueError(f"{path} cannot be used: {files.one_line(error)}; choose another --output") from None
 
 
 def run_all(study: Study, runs: Sequence[folder.Run]) -> None:

@@ -232,7 +232,7 @@ def make_config(environment: "str | envs.Env", algorithm: str = "cur", **overrid
     of_field = {key: field.default for key, field in known.items()}
     config = Config().replace(**of_field | of_place | {"environment": name, "algorithm": algorithm} | overrides)
     of_algorithm = priority.get_algorithm(algorithm).defaults(config)
-    config = config.replace(**of_algorithm | overrides)  # overrides again: a human_capacity that is given must not grow
+    config = config.replace(**{**of_algorithm, **overrides})  # again: a human_capacity that is given must not grow unasked
     validate(config, env)
     return config
 

@@ -1,7 +1,7 @@
 """The fleet's timestep: signals, priorities, allocation, actions, physics, data, resets, learning (paper, Section 3).
 
 `Fleet.plan` says which human helps which robot, `Fleet.advance` does the rest, and `Fleet.step` puts the simulated supervisor
-between them. It maps environment, supervisor and physics over the robots.
+between them. This module maps environment, supervisor and physics over the robots.
 """
 
 import dataclasses

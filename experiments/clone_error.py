@@ -100,7 +100,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     capacity = max(args.fresh, *args.demonstrations)
-    default = fleetjax.make_config(args.robot, "constraint_trained", extra_demonstrations=0, human_capacity=capacity)
+    default = fleetjax.make_config(args.robot, "constraint_trained", extra_demonstrations=0).replace(human_capacity=capacity)
     if args.gradient_steps is not None:
         default = default.replace(pretraining_steps=args.gradient_steps)
     env = fleetjax.envs.make(args.robot, default.backend)

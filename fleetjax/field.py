@@ -9,6 +9,15 @@ import itertools
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+# What a value of each kind is called in messages.
+KINDS: dict[type, str] = {
+    str: "a text",
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    tuple: "a list of whole numbers",
+}
+
 
 class Field(NamedTuple):
     """What is known of a parameter, be it a field of `Config` or an algorithm's own.
@@ -46,9 +55,9 @@ def _traced(default: Any, help: str, unit: str = "", *, low: float | None = 0, h
 class Fields:
     """The parameters that every run has. Static ones shape the program, traced ones are arrays."""
 
-    environment: str = _static("humanoid", "registered environment")
-    algorithm: str = _static("cur", "registered algorithm, or an order of the letters c, u, r")
-    supervisor: str = _static("", "registered supervisor; empty = the environment's own")
+    environment: str = _static("humanoid", "name of the environment")
+    algorithm: str = _static("cur", "name of the algorithm, or an order of the letters c, u, r")
+    supervisor: str = _static("", "name of the supervisor; empty = the environment's own")
     backend: str = _static("auto", "physics backend: native (CPU threads), mjx (pure JAX), auto")
     num_robots: int = _static(100, "robots N", low=1)
     num_humans: int = _static(10, "human supervisors M, at most N", low=1)
@@ -58,28 +67,35 @@ class Fields:
     batch_size: int = _static(256, "samples per gradient step", low=1)
     gradient_steps: int = _static(1, "gradient steps per timestep", low=0)
     augmented_copies: int = _static(1, "copies kept of each human pair; if more than 1, their images are augmented", low=1)
-    human_capacity: int = _static(0, "room for human data; 0 = as many as the run can produce", "pairs", low=0)
-    critic_capacity: int = _static(250_000, "room for the critics' data, at least N; the oldest go first", "transitions", low=1)
+    human_capacity: int = _static(0, "pairs of human data that fit; 0 = as many as the run can produce", low=0)
+    critic_capacity: int = _static(
+        250_000,
+        "room for the critics' data, at least one per robot; when it is full, new data replace the oldest",
+        "transitions",
+        low=1,
+    )
 
     min_teleop_time: int = _traced(5, "shortest teleoperation t_T", "timesteps", low=1)
     hard_reset_time: int = _traced(5, "duration of a hard reset t_R", "timesteps", low=1)
     initial_period: int = _traced(
-        0, "period t_I at the start in which rules with C leave violating robots waiting", "timesteps"
+        0, "first timesteps t_I in which cur and other orders with C send no human to robots in violation"
     )
     success_return: float = _traced(
         0.0, "return above which an episode of full length succeeds, where the environment judges by returns", low=None
     )
-    uncertainty_threshold: float = _traced(0.05, "uncertainty below which U is 0; in nats where actions are discrete")
-    risk_threshold: float = _traced(0.5, "risk below which R is 0", high=1)
+    uncertainty_threshold: float = _traced(
+        0.05, "robots below this uncertainty count as certain; in nats where actions are discrete"
+    )
+    risk_threshold: float = _traced(0.5, "robots below this risk count as safe", high=1)
     learning_rate: float = _traced(3e-4, "Adam's learning rate, policy and critics")
     normalize_observations: bool = _traced(
         True, "scale observations by the mean and standard deviation of the demonstrations (images: by a fixed scale)"
     )
-    num_demonstrations: int = _traced(5000, "offline pairs, from complete supervisor episodes", "pairs", low=1)
-    extra_demonstrations: int = _traced(0, "further offline pairs (the constraint baseline)", "pairs")
-    pretraining_steps: int = _traced(1000, "gradient steps on the demonstrations", "gradient steps")
-    critic_pretraining_steps: int = _traced(3000, "gradient steps on the offline transitions", "gradient steps")
-    num_critic_transitions: int = _traced(20_000, "offline transitions for the critic", "transitions")
+    num_demonstrations: int = _traced(5000, "offline pairs from supervisor episodes, the last one cut to fit", low=1)
+    extra_demonstrations: int = _traced(0, "further offline pairs (the constraint baseline)")
+    pretraining_steps: int = _traced(1000, "gradient steps on the demonstrations")
+    critic_pretraining_steps: int = _traced(3000, "gradient steps on the offline transitions")
+    num_critic_transitions: int = _traced(20_000, "offline transitions for the critic")
     critic_noise: float = _traced(0.25, "standard deviation of the action noise in those transitions")
     positive_fraction: float = _traced(0.25, "share of positives in a critic batch", high=1)
     risk_discount: float = _traced(0.5, "discount of the safety critic", high=1)

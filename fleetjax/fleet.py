@@ -1,7 +1,7 @@
 """The fleet's timestep: signals, priorities, allocation, actions, physics, data, resets, learning (paper, Section 3).
 
-`Fleet.plan` says who needs whom, `Fleet.advance` does the rest, and `Fleet.step` puts the simulated supervisor between
-them. This is the only module that maps over robots.
+`Fleet.plan` says which human helps which robot, `Fleet.advance` does the rest, and `Fleet.step` puts the simulated supervisor
+between them. This module maps environment, supervisor and physics over the robots.
 """
 
 import dataclasses

@@ -141,7 +141,7 @@ def test_a_registered_priority_is_an_algorithm(monkeypatch):
     fleetjax.register_priority("least_certain", make_least_certain, estimators=("goal",))
     assert "least_certain" in fleetjax.list_algorithms()
     assert priority.get_algorithm("least_certain").estimators == ("goal",)
-    with pytest.raises(ValueError, match="'least_certain' is registered already"):
+    with pytest.raises(ValueError, match="'least_certain' is already registered"):
         fleetjax.register_priority("least_certain", make_least_certain)
     fleetjax.register_priority("other", make_least_certain, estimators=("risk",))
     with pytest.raises(ValueError, match="estimator = 'risk' is unknown; the closest are"):

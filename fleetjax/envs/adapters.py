@@ -60,7 +60,9 @@ def from_playground(
     try:
         registry = importlib.import_module("mujoco_playground").registry
     except ImportError as error:
-        raise ImportError(f'from_playground needs MuJoCo Playground: pip install "fleetjax[playground]" ({error})') from error
+        raise ImportError(
+            f'from_playground needs MuJoCo Playground; run pip install ".[playground]" in the source folder ({error})'
+        ) from error
 
     if name not in registry.ALL_ENVS:
         raise ValueError(f"playground environment = {name!r} is unknown; choose one of {', '.join(registry.ALL_ENVS)}")

@@ -134,7 +134,7 @@ def observe(walker: Walker, action: jax.Array) -> jax.Array:
 
 
 def _reward(walker: Walker, target: jax.Array) -> jax.Array:
-    """Return the reward a second."""
+    """Return the reward per second."""
     body = walker.body
     linear, angular = base_velocity(body)
     missed = jnp.sum((linear[:2] - walker.command[:2]) ** 2)

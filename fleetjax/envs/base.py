@@ -53,7 +53,7 @@ class Scene(NamedTuple):
 
 
 class Env(NamedTuple):
-    """Pure functions of one robot's task. It never resets itself: that is what fleets compete for.
+    """Pure functions of one robot's task. It never resets itself. Robots compete for the humans who reset them.
 
     Attributes:
         reset: `(key, robot i32[]) -> EnvState`, a draw from the initial distribution of that robot.

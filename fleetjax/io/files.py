@@ -68,7 +68,7 @@ def check_free(path: Path, *, overwrite: bool, is_folder: bool = False) -> Path:
         OSError: if it cannot be written there.
     """
     if os.path.lexists(path) and not overwrite and not (is_folder and path.is_dir() and not any(path.iterdir())):
-        raise FileExistsError(f"{path} exists already; pass --overwrite to replace it")
+        raise FileExistsError(f"{path} already exists; pass --overwrite to replace it")
     if path.exists() and path.is_dir() != is_folder:
         raise FileExistsError(f"{path} is a {'file' if path.is_file() else 'folder'}; choose another --output")
     target = Path(os.path.realpath(path))

@@ -24,7 +24,7 @@ PORT = 8765  # that a console serves
 _ABOUT = """\
 Interactive fleet learning: N robots, M humans. Who should get help, and what does the fleet gain?
 
-  fleetjax run navigation               a small fleet, finished in a minute
+  fleetjax run navigation               100 point robots, a minute or two
   fleetjax run humanoid                 the paper's main experiment, C.U.R. with 100 humanoids
   fleetjax run humanoid --help          every parameter, with its meaning, unit and default
   fleetjax sweep navigation --seeds 5 --output DIR   many runs, in parallel
@@ -48,7 +48,8 @@ with the others. Thresholds do not carry over between robots, policies or sizes 
 same command resumes, and a finished one answers at once."""
 _RUN_NOTE = """\
 Some algorithms change defaults: expert has as many humans as robots; constraint gets as many extra demonstrations as C.U.R.
-uses human timesteps; constraint_trained also takes as many gradient steps before the start as the others take in total."""
+uses human timesteps (none where the environment does not ship); constraint_trained also takes as many gradient steps before
+the start as the others take in total."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -85,6 +86,8 @@ _RENDER_ABOUT = """Draw robots as an animation, a grid of tiles. Teleoperated ro
 
 expert: the supervisor acts on every robot. robot: the trained policy of a run acts, and nobody teleoperates. mixed: the
 pre-trained fleet runs, and its humans help."""
+_EVALUATE_ABOUT = """Run the trained policy of a run without teleoperation: humans only reset robots in violation, and nothing
+is learnt. Prints a table and writes RUN/evaluation.json."""
 _CONSOLE_ABOUT = """Run a fleet one timestep at a time, with people as supervisors: each opens a page, gets a seat, and helps
 the robot that the algorithm allocates. Ends with a table and a run folder as `fleetjax run` does, and a record of what people
 did, so that `fleetjax replay` can repeat the run."""
@@ -122,11 +125,11 @@ def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser
     plot.add_argument("--overwrite", action="store_true", help="replace an existing file")
 
     _add_compare(commands)
-    evaluate = commands.add_parser("evaluate", help="run a trained policy without teleoperation")
+    evaluate = commands.add_parser("evaluate", help="run a trained policy without teleoperation", description=_EVALUATE_ABOUT)
     evaluate.add_argument("run", metavar="RUN", type=Path, help="run folder")
     evaluate.add_argument("--num-steps", metavar="N", type=_integer, default=10_000, help="timesteps [default: 10000]")
     evaluate.add_argument("--seed", metavar="N", type=_seed, help="random seed [default: the run's, plus 1]")
-    evaluate.add_argument("--overwrite", action="store_true", help="replace the evaluation in the run folder")
+    evaluate.add_argument("--overwrite", action="store_true", help="replace an older evaluation.json in the run folder")
 
     export = commands.add_parser("export", help="write a run's interventions as a data set", description=_EXPORT_ABOUT)
     export.add_argument("run", metavar="RUN", type=Path, help="run folder")
@@ -256,14 +259,14 @@ def _add_calibrate(commands: Any, environment: str | None) -> None:
 
 
 def _add_console(commands: Any, environment: str | None) -> None:
-    usage = "fleetjax console ENV --humans M [--host HOST --token TOKEN] [--port N] [--output DIR] [parameters]"
+    usage = "fleetjax console ENV [--humans M] [--host HOST --token TOKEN] [--port N] [--output DIR] [parameters]"
     console = commands.add_parser(
         "console", help="let people supervise a fleet in their browsers", usage=usage, description=_CONSOLE_ABOUT
     )
     console.add_argument("environment", metavar="ENV", nargs="?", default=argparse.SUPPRESS, help="environment with pictures")
     console.add_argument("--host", default="127.0.0.1", help="address to listen on; any but this machine's own needs --token")
     console.add_argument("--port", metavar="N", type=_integer, default=PORT, help=f"port; 0 = any free one [default: {PORT}]")
-    console.add_argument("--token", help="token that pages need as ?token=TOKEN; at least 8 letters and digits")
+    console.add_argument("--token", help="token that pages need as ?token=TOKEN: 8 to 128 letters, digits, or . _ ~ -")
     console.add_argument("--interval", metavar="X", type=_number, help="seconds per timestep [default: the control step]")
     console.add_argument(
         "--timeout",

@@ -79,9 +79,9 @@ def check_folder(path: Path, *, overwrite: bool) -> None:
     if not os.path.lexists(path) or (path.is_dir() and {found.name for found in path.iterdir()} <= {files.LOCK}):
         return
     if not is_run(path):
-        raise FileExistsError(f"{path} exists already and is not a run folder; choose another --output")
+        raise FileExistsError(f"{path} already exists and is not a run folder; choose another --output")
     if not overwrite:
-        raise FileExistsError(f"{path} exists already; choose another --output, or pass --overwrite")
+        raise FileExistsError(f"{path} already exists; choose another --output, or pass --overwrite")
 
 
 def prepare(run: Run) -> bool:
@@ -173,7 +173,8 @@ def _blame(path: Path) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError:
-        raise ValueError(f"{path} is missing, so this is not the folder of a finished run") from None
+        reason = "this is not a run folder" if path.name == CONFIG else "the run did not finish"
+        raise ValueError(f"{path} is missing, so {reason}") from None
     except RecursionError:
         raise ValueError(f"{path} is damaged: it is nested too deeply") from None
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError, csv.Error) as error:
@@ -225,8 +226,13 @@ def read_finished(run: Run) -> Metrics | None:
         if run.logged:
             read_interventions(run)
     except ValueError as error:
-        raise ValueError(f"{error}; delete the folder, or start it again with --overwrite") from None
+        raise ValueError(f"{error}; delete the folder, or {from_the_start(run)}") from None
     return metrics
+
+
+def from_the_start(run: Run) -> str:
+    """Return the remedy for a run that can neither be resumed nor used."""
+    return f"run it from the start: fleetjax run {run.config.environment} ... --output {run.folder} --overwrite"
 
 
 def _versions_from(entries: Any) -> tuple[Mapping[str, Any], ...]:

@@ -1,7 +1,7 @@
 """A run in its folder: started or resumed, chunk after chunk, with checkpoints, until it ends or is stopped.
 
 A run that was killed and resumed gives the same bits as one that was not: chunks and checkpoints change nothing, the key of
-timestep t is `fold_in(key, t)`, and the files are cut back to the checkpoint's timestep.
+timestep t is `keys.key_at(key, t)`, and the files are cut back to the checkpoint's timestep.
 """
 
 import contextlib
@@ -162,7 +162,8 @@ def _resume(run: folder.Run) -> Start | None:
         say(f"skipped checkpoint {reason}")
     if found is None:
         if checkpoint.is_any_finished(run.folder):
-            raise Refusal(f"{run.folder} has no checkpoint that can be used; delete it, or start it again with --overwrite")
+            reason = f"{run.folder} has no checkpoint that can be used"
+            raise Refusal(f"{reason}; delete the folder, or {folder.from_the_start(run)}")
         say("no checkpoint was written yet; starting from t = 0")
         return None
     say(f"resuming from {found.path}")
@@ -199,9 +200,8 @@ def _check(chunk: Metrics, done: int, run: folder.Run) -> None:
     found = first_divergence(chunk)
     if found:
         first, names = found
-        when = f"from t = {done - len(chunk.diverged) + first} on"
-        remedy = f"try a smaller learning_rate. The metrics so far are in {run.folder}"
-        raise Diverged(f"not finite {when}: {', '.join(names)}; {remedy}")
+        what = text.divergence(done - len(chunk.diverged) + first, names)
+        raise Diverged(f"{what}. The metrics so far are in {run.folder}")
 
 
 def unbegun(run: folder.Run, *, new: bool) -> KeyboardInterrupt:

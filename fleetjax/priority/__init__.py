@@ -1,6 +1,6 @@
-"""Rules for who gets help: from signals of the robots to scores (paper, Section 4.2). One file a family.
+"""Rules for who gets help: from signals of the robots to scores (paper, Section 4.2). One file per family.
 
-A priority is two pure functions. A new one is about ten lines:
+A rule is a `Priority`: two pure functions. A new one is about ten lines:
 
     def make_least_certain(config):
         def score(signals, aux, key):

@@ -56,7 +56,7 @@ def score(
     key: jax.Array,
     view: View = everything,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Run one episode a robot under a policy.
+    """Run one episode per robot under a policy.
 
     Args:
         env: the environment.

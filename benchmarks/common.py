@@ -21,13 +21,13 @@ from fleetjax.io import flags
 from fleetjax.physics.base import MODELS, PhysicsState
 from fleetjax.physics.native import num_threads
 
-# Substeps of a control step, and `(action, model) -> controls`.
+# Substeps of a control step, and `(end of the observation, model) -> controls`: what the servos or motors were last told.
 ROBOTS: dict[str, tuple[int, Callable[[jax.Array, mujoco.MjModel], jax.Array]]] = {
     "humanoid": (humanoid.SUBSTEPS, lambda action, model: action),
     "anymal": (anymal.SUBSTEPS, lambda action, model: anymal.targets(action)),
     "allegro_hand": (
         allegro_hand.SUBSTEPS,
-        lambda action, model: allegro_hand.targets(action, *jnp.float32(model.jnt_range[:16].T)),
+        lambda target, model: allegro_hand.angles(target, *jnp.float32(model.jnt_range[:16].T)),
     ),
 }
 
@@ -70,6 +70,12 @@ def median_seconds(function: Callable[..., Any], *args: Any, repeats: int = 5) -
     """Return the median seconds of `repeats` runs, after one that compiles."""
     jax.block_until_ready(function(*args))
     return statistics.median(seconds(function, *args)[0] for _ in range(repeats))
+
+
+def same_again(env: fleetjax.Env, obs: jax.Array) -> jax.Array:
+    """Return actions f32[N, A] that repeat the last controls, given observations f32[N, O], which end with them."""
+    last = obs[:, -env.spec.action_size :]
+    return jnp.zeros_like(last) if env.spec.name == "allegro_hand" else last  # the hand's actions change its targets
 
 
 def body_of(physics: Any) -> PhysicsState:

@@ -27,6 +27,7 @@ from common import (
     matrix_rate,
     parse,
     product_timer,
+    same_again,
     seconds,
     stretch,
     table,
@@ -48,7 +49,7 @@ def measure(environment: str, parameters: dict[str, Any], *, num_steps: int, rep
     operations = sum(number * product.operations for product, number in products.items())
     timers = {product: product_timer(product) for product in products}
     keys = jax.random.split(key, config.num_robots)
-    physics_step = jax.jit(lambda s: jax.vmap(env.step)(s, s.obs[:, -env.spec.action_size :], ~s.violation, keys))
+    physics_step = jax.jit(lambda s: jax.vmap(env.step)(s, same_again(env, s.obs), ~s.violation, keys))
     jax.block_until_ready(physics_step(state.env))
 
     steps, bounds, physics, learning, large, moving = [], [], [], [], [], []

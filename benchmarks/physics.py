@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from common import REGISTERED, RawRollout, add_names, body_of, seconds, table
+from common import REGISTERED, RawRollout, add_names, body_of, same_again, seconds, table
 
 import fleetjax
 from fleetjax.physics.base import make_physics
@@ -24,7 +24,7 @@ def warm_up(environment: str, num_robots: int) -> tuple[Any, jax.Array]:
     def step(state, key):
         key_noise, key_env = jax.random.split(key)
         noise = 0.1 * jax.random.normal(key_noise, (num_robots, env.spec.action_size))
-        action = jnp.clip(state.obs[:, -env.spec.action_size :] + noise, -1.0, 1.0)
+        action = jnp.clip(same_again(env, state.obs) + noise, -1.0, 1.0)
         return jax.vmap(env.step)(state, action, jnp.ones(num_robots, bool), jax.random.split(key_env, num_robots)), None
 
     start = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), num_robots), jnp.arange(num_robots))

@@ -1,4 +1,4 @@
-"""Run the paper's block-pushing experiment: 4 robots, 2 humans, 250 pushes, several seeds; print the table, draw the figure.
+"""Run the paper's block-pushing experiment: 4 robots, 2 humans, 250 pushes, several seeds; print the tables, draw the figure.
 
     python experiments/block_push.py [--seeds 0 1 2] [--output runs/block_push] [-- PARAMETERS]
 

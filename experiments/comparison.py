@@ -1,4 +1,4 @@
-"""What scripts share that compare algorithms: run what is missing, then one table and one figure of all."""
+"""What scripts share that compare algorithms: run what is missing, then tables and one figure of all."""
 
 import argparse
 import subprocess
@@ -6,15 +6,11 @@ import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-import numpy as np
-
 import fleetjax
-from fleetjax.config import Config
-from fleetjax.io import figure, files, folder, text
-from fleetjax.metrics import Metrics
+from fleetjax.io import figure, files, folder
+from fleetjax.io.sources import collect
 
 ALGORITHMS = ("constraint", "constraint_trained", "random", "ensemble_dagger", "thrifty_dagger", "cur", "expert")
-COLUMNS = {"successes": "successes", "violations": "violations", "idle": "idle", "human_steps": "human time"}
 Case = tuple[str, str, int]  # environment, algorithm, seed
 
 
@@ -35,8 +31,8 @@ def finished(path: Path) -> bool:
         return False
 
 
-def run_missing(cases: Iterable[Case], output: Path, parameters: Sequence[str]) -> list[tuple[Config, int, Metrics]]:
-    """Run the cases that are not finished yet, one after the other; return the configuration, seed and metrics of all.
+def run_missing(cases: Iterable[Case], output: Path, parameters: Sequence[str]) -> list[Path]:
+    """Run the cases that are not finished yet, one after the other; return the folders of all.
 
     Args:
         cases: what to run.
@@ -51,41 +47,15 @@ def run_missing(cases: Iterable[Case], output: Path, parameters: Sequence[str]) 
         if not finished(path):
             command = [sys.executable, "-m", "fleetjax", "run", environment, "--algorithm", algorithm]
             subprocess.run([*command, "--seed", str(seed), "--output", path, "--overwrite", *parameters], check=True)
-    runs = [folder.read_run(path) for path in paths.values()]
-    return [(run.config, run.seed, folder.read_metrics(run)) for run in runs]
+    return list(paths.values())
 
 
-def table(data: list[tuple[Config, int, Metrics]]) -> str:
-    """Return a Markdown table, a row for each environment and algorithm: means over seeds, and their deviation if several."""
-    head = ["environment", "algorithm", *COLUMNS.values(), "late successes", "ROHE"]
-    rows = [head, ["---", "---"] + ["---:"] * (len(head) - 2)]
-    for environment, algorithm in dict.fromkeys((config.environment, config.algorithm) for config, _, _ in data):
-        runs = [(c, m) for c, _, m in data if (c.environment, c.algorithm) == (environment, algorithm)]
-        totals = [text.add_up(m) for _, m in runs]
-        cells = [_shown([total[name] for total in totals], 0) for name in COLUMNS]
-        late = _shown([_late_successes(m) for _, m in runs], 0)
-        return_ = _shown([text.rohe_of(total, config) for (config, _), total in zip(runs, totals, strict=True)], 3)
-        rows.append([environment, text.label(algorithm), *cells, late, return_])
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
-
-
-def _late_successes(metrics: Metrics) -> float:
-    """Return how many successes fell into the last quarter of a run, when most is learnt."""
-    length = len(metrics.successes)
-    return float(np.sum(metrics.successes[length - length // 4 :]))
-
-
-def _shown(values: list[float], digits: int) -> str:
-    mean = f"{np.mean(values):,.{digits}f}"
-    return f"{mean} ± {np.std(values, ddof=1):,.{digits}f}" if len(values) > 1 else mean
-
-
-def show(data: list[tuple[Config, int, Metrics]], picture: Path) -> None:
-    """Print the table, and draw the figure; the expert, whose curves would flatten the others, is in it if it is alone."""
-    print(table(data))
-    shown = [entry for entry in data if entry[0].algorithm != "expert"] or data
-    files.write(picture, figure.render(figure.draw(figure.group(shown))))
-    print(f"\n{picture}")
+def show(runs: Sequence[Path], picture: Path) -> None:
+    """Print the tables, and draw the figure; the expert, whose curves would flatten the others, is in it if it is alone."""
+    print(fleetjax.compare(runs).markdown())
+    shown = [run for run in collect(runs) if run.config.algorithm != "expert"] or runs
+    files.write(picture, figure.render(fleetjax.plot(shown)))
+    print(picture)
 
 
 def make_parser(about: str | None, *, output: Path, seeds: list[int]) -> argparse.ArgumentParser:

@@ -1,4 +1,4 @@
-"""Run every algorithm on every robot that it fits, at the paper's scale with one seed; print the table, draw the figure.
+"""Run every algorithm on every robot that it fits, at the paper's scale with one seed; print the tables, draw the figure.
 
     python experiments/first_look.py [--environments humanoid anymal ...] [--output runs/first_look] [-- PARAMETERS]
 

@@ -94,8 +94,6 @@ class Task(BraxEnv):
         """Take one control step; a violation ends the episode."""
         key_next, key_vary, key_step, key_goal = jax.random.split(state.info["key"], 4)
         before = self.stage.vary(state.pipeline_state, key_vary)
-        if self.training.step_size:
-            action = expert.add_to_last(before.obs, self.training.step_size * jnp.clip(action, -1.0, 1.0))
         after = self.env.step(before, action, jnp.bool_(True), key_step)
         reward, done = self.stage.reward(before, after), after.violation.astype(jnp.float32)
         success = after.success.astype(jnp.float32)
@@ -253,7 +251,6 @@ def as_weights(params, training: Training) -> dict[str, np.ndarray]:
         actions = layer["bias"].size // 2 if layer is layers[-1] and not clipped else None  # the other half are their scales
         weights[f"kernel_{i}"], weights[f"bias_{i}"] = layer["kernel"][:, :actions], layer["bias"][:actions]
     weights |= {"bound": np.float32(1.0)} if clipped else {}
-    weights |= {"step_size": np.float32(training.step_size)} if training.step_size else {}
     return {name: np.asarray(value, np.float32) for name, value in weights.items()}
 
 

@@ -59,7 +59,6 @@ class Training(NamedTuple):
         hidden_sizes: units of the hidden layers of policy and value network.
         network: what else brax's networks are built with.
         episode_length: of training, in control steps; a stage may have its own.
-        step_size: where given, the policy's outputs times this are added to the last action, which is the observation's end.
         view: what the networks see of an observation.
     """
 
@@ -70,7 +69,6 @@ class Training(NamedTuple):
     stages: tuple[Stage, ...]
     hidden_sizes: tuple[int, ...] = (256, 128)
     network: Mapping[str, Any] = {}
-    step_size: float | None = None
     view: expert.View = expert.everything
 
 
@@ -229,7 +227,6 @@ TRAININGS = {
         hidden_sizes=(256, 256),
         network=CLIPPED_NORMAL | {"init_noise_std": 0.6},
         view=allegro_hand.view,
-        step_size=0.3,
         episode_length=allegro_hand.HORIZON,
         stages=(
             Stage(TURNING, turning, options={"tolerance": 0.4}),

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from fleetjax.experiment import Result, evaluate, extend, prepare, run, run_logged
     from fleetjax.field import Field
     from fleetjax.fleet import Fleet, FleetState, make_fleet
+    from fleetjax.io.comparing import compare
+    from fleetjax.io.comparison import Comparison
+    from fleetjax.io.figure import plot
     from fleetjax.learning.estimators import Estimator, Step, register_estimator
     from fleetjax.metrics import Metrics, first_divergence, rohe
     from fleetjax.priority import Algorithm, Priority, list_algorithms, register_algorithm, register_priority
@@ -24,6 +27,7 @@ if TYPE_CHECKING:
 __version__ = VERSION
 __all__ = [
     "Algorithm",
+    "Comparison",
     "Config",
     "Env",
     "EnvSpec",
@@ -43,6 +47,7 @@ __all__ = [
     "Supervisor",
     "allocate",
     "check_env",
+    "compare",
     "envs",
     "evaluate",
     "extend",
@@ -52,6 +57,7 @@ __all__ = [
     "list_supervisors",
     "make_config",
     "make_fleet",
+    "plot",
     "prepare",
     "register_algorithm",
     "register_env",
@@ -74,6 +80,9 @@ _NAMES = {
     "experiment": ["Result", "evaluate", "extend", "prepare", "run", "run_logged"],
     "field": ["Field"],
     "fleet": ["Fleet", "FleetState", "make_fleet"],
+    "io.comparing": ["compare"],
+    "io.comparison": ["Comparison"],
+    "io.figure": ["plot"],
     "learning.estimators": ["Estimator", "Step", "register_estimator"],
     "metrics": ["Metrics", "first_divergence", "rohe"],
     "priority": ["Algorithm", "Priority", "list_algorithms", "register_algorithm", "register_priority"],

@@ -20,6 +20,7 @@ from fleetjax.metrics import Metrics
 from fleetjax.precision import in_32_bits
 
 _GIB = 2**30
+_REMEDY = "call prepare with this configuration"
 # Where Linux keeps the limit of a container's memory: control groups, version 2 and 1.
 _LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 
@@ -81,8 +82,8 @@ def check_memory(config: Config, state: FleetState) -> None:
     if needed > limit:
         largest = max(parts, key=lambda name: parts[name])
         raise ValueError(
-            f"{largest} = {getattr(config, largest)} is too large: the run needs at least {needed / _GIB:,.2f} GiB of memory, "
-            f"{parts[largest] / _GIB:,.2f} of them for this, but only {limit / _GIB:,.2f} are available"
+            f"{largest} = {getattr(config, largest)} is too large: the run needs at least {needed / _GIB:,.2f} GiB of memory "
+            f"({parts[largest] / _GIB:,.2f} GiB for this field), but only {limit / _GIB:,.2f} GiB are available"
         )
 
 
@@ -110,33 +111,38 @@ def check_state(config: Config, env: Env, state: FleetState, shapes: FleetState)
         shapes: what the state must look like.
 
     Raises:
-        ValueError: if the state is another environment's, algorithm's or fleet's, or (where its numbers are concrete) has no
-            room for the pairs that the run can give.
+        ValueError: if the state is another environment's or fleet's, its layout differs (other networks, estimators or memory
+            of the rule), or (where its numbers are concrete) it has no room for the pairs that the run can give.
     """
     made = state.origin
     if made.environment not in ("", env.spec.name):
-        raise ValueError(
-            f"environment = {env.spec.name!r}, but the state was prepared for {made.environment!r}; prepare one for it"
-        )
+        raise ValueError(f"environment = {env.spec.name!r}, but the state was prepared for {made.environment!r}; {_REMEDY}")
     if state.resetting.ndim != 1:
         raise ValueError("the state holds several fleets; use jax.vmap or jax.lax.map over them")
     sizes = {"num_robots": state.resetting.shape[0], "num_humans": state.humans.robot.shape[0]}
     for name, found in sizes.items():
         if found != getattr(config, name):
-            raise ValueError(f"{name} = {getattr(config, name)}, but the state was prepared for {found}; prepare one for it")
+            raise ValueError(f"{name} = {getattr(config, name)}, but the state was prepared for {found}; {_REMEDY}")
     wanted, given = _layout(shapes), _layout(state)
     if jax.tree.structure(wanted) != jax.tree.structure(given):
-        raise ValueError(
-            f"algorithm = {config.algorithm!r} keeps other estimators or another memory than {made.algorithm!r}, for which the "
-            "state was prepared; prepare one for it"
-        )
+        raise ValueError(_other_structure(config, made.algorithm))
     for (path, found), leaf in zip(jax.tree_util.tree_leaves_with_path(given), jax.tree.leaves(wanted), strict=True):
         if (found.shape, found.dtype) != (leaf.shape, leaf.dtype):
             raise ValueError(
                 f"the state does not fit the configuration: its {jax.tree_util.keystr(path)} is {_shown(found)}; "
-                f"expected {_shown(leaf)}; prepare one for it"
+                f"expected {_shown(leaf)}; {_REMEDY}"
             )
     _check_room(config, state)
+
+
+def _other_structure(config: Config, made_for: str) -> str:
+    """Return the message for a state with another structure than a run needs."""
+    if config.algorithm == made_for:
+        return f"the state has another structure than this configuration needs (hidden_sizes, estimators); {_REMEDY}"
+    return (
+        f"algorithm = {config.algorithm!r} keeps other estimators or another memory than {made_for!r}, for which the state was "
+        f"prepared; {_REMEDY}"
+    )
 
 
 def _layout(state: FleetState) -> FleetState:

@@ -1,4 +1,4 @@
-"""The command line: `fleetjax run`, `list`, `plot`, `evaluate`, `export`, `render`, `console` and `replay`.
+"""The command line: `fleetjax run`, `sweep`, `calibrate`, `list`, `plot`, `compare`, `evaluate`, `export`, `render`, and so on.
 
 What cannot be used is refused with one line on stderr and exit code 2, before anything is computed.
 """
@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 
 from fleetjax.io import files, flags
-from fleetjax.io.errors import Disagreement, Diverged, Refusal
+from fleetjax.io.errors import Disagreement, Diverged, Incomplete, Refusal
 
 INTERRUPTED = 130  # what shells report for a process that SIGINT ended
 
@@ -21,8 +21,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: arguments; None takes the process's, which Ctrl-C then ends at once.
 
     Returns:
-        int: exit code: 0, 1 for a run that diverged or a replay that differs, 2 for input that cannot be used, 130 after
-            Ctrl-C.
+        int: exit code: 0, 1 for a run that diverged, a replay that differs or a sweep with runs that failed, 2 for input that
+            cannot be used, 130 after Ctrl-C.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -34,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         commands.COMMANDS[arguments.command](arguments)
     except (Refusal, OSError) as error:
         return _end(files.one_line(error), 2)
-    except (Diverged, Disagreement) as error:
+    except (Diverged, Disagreement, Incomplete) as error:
         return _end(str(error), 1)
     except KeyboardInterrupt as interrupt:
         code = _end(" ".join(["interrupted", *interrupt.args]), INTERRUPTED)

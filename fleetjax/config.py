@@ -13,7 +13,7 @@ import numpy as np
 from jax.core import Tracer
 
 from fleetjax import envs, priority, supervisors
-from fleetjax.field import FIELDS, Field, Fields, owners
+from fleetjax.field import FIELDS, KINDS, Field, Fields, owners
 from fleetjax.physics.base import BACKENDS
 from fleetjax.registry import unknown
 
@@ -39,14 +39,15 @@ class Config(Fields):
             ValueError: if a field is unknown, a parameter is another algorithm's, an integer field gets a value that is not an
                 integer, or the number of demonstrations is traced and no `human_capacity` says how many pairs there may be.
         """
-        known = all_fields(changes.get("algorithm", self.algorithm))
+        algorithm = changes.get("algorithm", self.algorithm)
+        known = all_fields(algorithm)
         for name in changes:
             if name not in known:
-                raise ValueError(_not_known(name, changes.get("algorithm", self.algorithm)))
+                raise ValueError(_not_known(name, algorithm))
         typed = {name: _typed(name, known[name], value) for name, value in changes.items()}
         own = self.parameters
-        if "algorithm" in changes and changes["algorithm"] != self.algorithm:
-            own = _default_parameters(changes.get("environment", self.environment), changes["algorithm"])
+        if not own or algorithm != self.algorithm:
+            own = _default_parameters(changes.get("environment", self.environment), algorithm)
         own = {**own, **{name: typed.pop(name) for name in list(typed) if name not in FIELDS}}
         return _with_capacity(self, dataclasses.replace(self, **typed, parameters=own), changes)
 
@@ -103,7 +104,7 @@ def _as_static(name: str, field: Field, value: Any) -> Any:
     if kind is str and isinstance(value, str):
         return value
     if kind is str or not (isinstance(value, (tuple, list)) if kind is tuple else _is_integer(value)):
-        raise ValueError(f"{name} = {value!r} must be of type {kind.__name__}")
+        raise ValueError(f"{name} = {value!r} must be {KINDS[kind]}")
     numbers = list(value) if kind is tuple else [value]
     if not all(map(_is_integer, numbers)):
         raise ValueError(f"{name} = {value!r} must hold whole numbers")
@@ -147,13 +148,12 @@ def _check_whole(name: str, field: Field, array: "jax.Array | np.ndarray") -> No
         ValueError: if they do not, or are floats so large that they may stand for another whole number.
     """
     is_float = jnp.issubdtype(array.dtype, jnp.floating)
-    if not _is_concrete(array):
-        if is_float:
-            raise ValueError(f"{name} = {array} must be a whole number of {field.unit}")
+    values = np.asarray(array, np.float64) if _is_concrete(array) else None
+    whole = not is_float if values is None else np.all(np.isfinite(values) & (values == np.round(values)))
+    if not whole:
+        raise ValueError(f"{name} = {array} must be a whole number{f' of {field.unit}' if field.unit else ''}")
+    if values is None:
         return
-    values = np.asarray(array, np.float64)
-    if not np.all(np.isfinite(values) & (values == np.round(values))):
-        raise ValueError(f"{name} = {array} must be a whole number of {field.unit}")
     if np.any(np.abs(values) > _LARGEST):
         raise ValueError(f"{name} = {array} must lie within 32 bits")
     if is_float and np.any(np.abs(values) > _LARGEST_EXACT):
@@ -198,8 +198,8 @@ def _with_capacity(before: Config, after: Config, changes: Mapping[str, Any]) ->
     for name in _OFFLINE:
         if name in changes and not _is_concrete(getattr(after, name)):
             raise ValueError(
-                f"{name} is traced, so the room for human data is not known; pass human_capacity as well, the most "
-                f"pairs that a run can hold: the largest number of demonstrations and {taught_pairs(after)} of teleoperation"
+                f"{name} is traced. Also pass human_capacity: the largest number of demonstrations times "
+                f"augmented_copies, plus {taught_pairs(after)}"
             )
     longer = max(0, taught_pairs(after) - taught_pairs(before))
     return dataclasses.replace(after, human_capacity=before.human_capacity + longer)
@@ -230,10 +230,13 @@ def make_config(environment: "str | envs.Env", algorithm: str = "cur", **overrid
         if override not in known:
             raise ValueError(_not_known(override, algorithm))
     of_place = {key: value for key, value in defaults.items() if key in known}
+    spec = (env or envs.make(name, overrides.get("backend", "auto"))).spec
+    if spec.success_return is not None:
+        of_place["success_return"] = spec.success_return
     of_field = {key: field.default for key, field in known.items()}
     config = Config().replace(**of_field | of_place | {"environment": name, "algorithm": algorithm} | overrides)
     of_algorithm = priority.get_algorithm(algorithm).defaults(config)
-    config = config.replace(**{key: value for key, value in of_algorithm.items() if key not in overrides})
+    config = config.replace(**{**of_algorithm, **overrides})  # again: a human_capacity that is given must not grow unasked
     validate(config, env)
     return config
 
@@ -255,7 +258,7 @@ def validate(config: Config, env: "envs.Env | None" = None) -> None:
             f"num_humans = {config.num_humans} is more than num_robots = {config.num_robots}; a human helps one robot at a time"
         )
     if not config.hidden_sizes or min(config.hidden_sizes) < 1:
-        raise ValueError(f"hidden_sizes = {config.hidden_sizes} must name one or more layers of at least 1 unit")
+        raise ValueError(f"hidden_sizes = {config.hidden_sizes} must be one or more numbers, each at least 1")
     if config.backend not in BACKENDS:
         raise ValueError(unknown("backend", config.backend, BACKENDS))
     algorithm = priority.get_algorithm(config.algorithm)
@@ -299,12 +302,16 @@ def _check_data(config: Config, algorithm: priority.Algorithm) -> None:
         pairs = np.min(np.asarray(config.num_demonstrations) + np.asarray(config.extra_demonstrations))
         if config.batch_size > pairs:
             raise ValueError(
-                f"batch_size = {config.batch_size} is larger than the data: num_demonstrations + extra_demonstrations = {pairs}"
+                f"batch_size = {config.batch_size} is larger than the data: num_demonstrations + extra_demonstrations = "
+                f"{pairs}; lower batch_size or raise num_demonstrations"
             )
     needed = needed_human_capacity(config)
     if max(needed, config.human_capacity) > _LARGEST:
         raise ValueError(
-            f"human_capacity = {needed} pairs, which this run can produce, must lie within 32 bits; shorten num_steps"
+            f"human_capacity = {needed} pairs, which this run can produce, must lie within 32 bits; lower num_steps"
         )
     if config.human_capacity < needed:
-        raise ValueError(f"human_capacity = {config.human_capacity} is less than the {needed} pairs that this run can produce")
+        raise ValueError(
+            f"human_capacity = {config.human_capacity} is less than the {needed} pairs that this run can produce; "
+            f"omit it, or pass at least {needed}"
+        )

@@ -22,7 +22,7 @@ class Result(NamedTuple):
     """What a run gives.
 
     Attributes:
-        metrics: Metrics[T], one row a timestep.
+        metrics: Metrics[T], one row per timestep.
         state: FleetState after the last timestep.
     """
 
@@ -90,10 +90,10 @@ def extend(state: FleetState, num_pairs: int) -> FleetState:
 def run(config: Config, key: jax.Array, state: FleetState | None = None, env: envs.Env | None = None) -> Result:
     """Run a fleet for `config.num_steps` timesteps.
 
-    Pure: `jax.jit`, `jax.vmap` over keys and over configs, and so on. Each timestep derives its key from `key`, so a run
-    continued from one of its own states, with the same key, gives the same result. `vmap` computes runs side by side, which
-    rounds matrix products differently, and a last bit can decide who is helped; `jax.lax.map` gives each run the bits that it
-    has alone.
+    Pure, so you can use `jax.jit`, and `jax.vmap` over keys and configs. Each timestep derives its key from `key`, so a run
+    continued from one of its own states, with the same key, gives the same result. `jax.vmap` computes runs side by side and
+    rounds matrix products differently; a last bit can decide who is helped. With `jax.lax.map` each run gives exactly the
+    result of a single run.
 
     Args:
         config: configuration.
@@ -106,8 +106,9 @@ def run(config: Config, key: jax.Array, state: FleetState | None = None, env: en
 
     Raises:
         ValueError: if the configuration is not valid, the run cannot fit the memory, or the state does not fit the
-            configuration: another environment, algorithm, fleet or network, or no room for the pairs that humans can give
-            (`extend` makes room; where the state's numbers are traced, `Metrics.dropped` counts what was lost).
+            configuration: it is another environment's or fleet's, its layout differs (other networks, estimators or memory
+            of the rule), or it has no room for the pairs that humans can give (`extend` makes room; where the state's
+            numbers are traced, `Metrics.dropped` counts what was lost).
 
     Reference: paper, Sections 3 and 4.
     """

@@ -5,8 +5,18 @@ help of the command line is made from these tables, without loading JAX.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Mapping
 from typing import Any, NamedTuple
+
+# What a value of each kind is called in messages.
+KINDS: dict[type, str] = {
+    str: "a text",
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    tuple: "a list of whole numbers",
+}
 
 
 class Field(NamedTuple):
@@ -45,9 +55,9 @@ def _traced(default: Any, help: str, unit: str = "", *, low: float | None = 0, h
 class Fields:
     """The parameters that every run has. Static ones shape the program, traced ones are arrays."""
 
-    environment: str = _static("humanoid", "registered environment")
-    algorithm: str = _static("cur", "registered algorithm, or an order of the letters c, u, r")
-    supervisor: str = _static("", "registered supervisor; empty = the environment's own")
+    environment: str = _static("humanoid", "name of the environment")
+    algorithm: str = _static("cur", "name of the algorithm, or an order of the letters c, u, r")
+    supervisor: str = _static("", "name of the supervisor; empty = the environment's own")
     backend: str = _static("auto", "physics backend: native (CPU threads), mjx (pure JAX), auto")
     num_robots: int = _static(100, "robots N", low=1)
     num_humans: int = _static(10, "human supervisors M, at most N", low=1)
@@ -57,25 +67,35 @@ class Fields:
     batch_size: int = _static(256, "samples per gradient step", low=1)
     gradient_steps: int = _static(1, "gradient steps per timestep", low=0)
     augmented_copies: int = _static(1, "copies kept of each human pair; if more than 1, their images are augmented", low=1)
-    human_capacity: int = _static(0, "room for human data; 0 = as many as the run can produce", "pairs", low=0)
-    critic_capacity: int = _static(250_000, "room for the critics' data, at least N; the oldest go first", "transitions", low=1)
+    human_capacity: int = _static(0, "pairs of human data that fit; 0 = as many as the run can produce", low=0)
+    critic_capacity: int = _static(
+        250_000,
+        "room for the critics' data, at least one per robot; when it is full, new data replace the oldest",
+        "transitions",
+        low=1,
+    )
 
     min_teleop_time: int = _traced(5, "shortest teleoperation t_T", "timesteps", low=1)
     hard_reset_time: int = _traced(5, "duration of a hard reset t_R", "timesteps", low=1)
     initial_period: int = _traced(
-        0, "period t_I at the start in which rules with C leave violating robots waiting", "timesteps"
+        0, "first timesteps t_I in which cur and other orders with C send no human to robots in violation"
     )
-    uncertainty_threshold: float = _traced(0.05, "uncertainty below which U is 0; in nats where actions are discrete")
-    risk_threshold: float = _traced(0.5, "risk below which R is 0", high=1)
+    success_return: float = _traced(
+        0.0, "return above which an episode of full length succeeds, where the environment judges by returns", low=None
+    )
+    uncertainty_threshold: float = _traced(
+        0.05, "robots below this uncertainty count as certain; in nats where actions are discrete"
+    )
+    risk_threshold: float = _traced(0.5, "robots below this risk count as safe", high=1)
     learning_rate: float = _traced(3e-4, "Adam's learning rate, policy and critics")
     normalize_observations: bool = _traced(
         True, "scale observations by the mean and standard deviation of the demonstrations (images: by a fixed scale)"
     )
-    num_demonstrations: int = _traced(5000, "offline pairs, from complete supervisor episodes", "pairs", low=1)
-    extra_demonstrations: int = _traced(0, "further offline pairs (the constraint baseline)", "pairs")
-    pretraining_steps: int = _traced(1000, "gradient steps on the demonstrations", "gradient steps")
-    critic_pretraining_steps: int = _traced(3000, "gradient steps on the offline transitions", "gradient steps")
-    num_critic_transitions: int = _traced(20_000, "offline transitions for the critic", "transitions")
+    num_demonstrations: int = _traced(5000, "offline pairs from supervisor episodes, the last one cut to fit", low=1)
+    extra_demonstrations: int = _traced(0, "further offline pairs (the constraint baseline)")
+    pretraining_steps: int = _traced(1000, "gradient steps on the demonstrations")
+    critic_pretraining_steps: int = _traced(3000, "gradient steps on the offline transitions")
+    num_critic_transitions: int = _traced(20_000, "offline transitions for the critic")
     critic_noise: float = _traced(0.25, "standard deviation of the action noise in those transitions")
     positive_fraction: float = _traced(0.25, "share of positives in a critic batch", high=1)
     risk_discount: float = _traced(0.5, "discount of the safety critic", high=1)
@@ -85,6 +105,13 @@ class Fields:
 
 FIELDS: dict[str, Field] = {f.name: f.metadata["field"] for f in dataclasses.fields(Fields)}
 
+# The orders of C, U and R, such as C.U.R.
+ORDERS = tuple("".join(letters) for size in (3, 2, 1) for letters in itertools.permutations("cur", size))
+ORDERS_WITH_C = tuple(letters for letters in ORDERS if "c" in letters)
+_IDLE = Field(
+    "in the initial period, humans whom nobody else needs teleoperate random robots", kind=bool, high=None, default=False
+)
+
 # The parameters that an algorithm has besides, by its name. `register_algorithm` adds those of others.
 PARAMETERS: dict[str, Mapping[str, Field]] = {
     "random": {"random_threshold": Field("scores below this become 0", high=1, default=0.9)},
@@ -92,6 +119,7 @@ PARAMETERS: dict[str, Mapping[str, Field]] = {
         "thrifty_weight": Field("weight of the chance of failure", high=1, default=0.25),
         "thrifty_threshold": Field("normalised scores at or below this become 0", default=3.25),
     },
+    **{letters: {"idle_humans_teleoperate": _IDLE} for letters in ORDERS_WITH_C},
 }
 
 
@@ -103,3 +131,14 @@ def every_field() -> dict[str, Field]:
 def owners(name: str) -> tuple[str, ...]:
     """Return the algorithms that have a parameter of this name."""
     return tuple(algorithm for algorithm, own in PARAMETERS.items() if name in own)
+
+
+def owners_in_words(name: str) -> str:
+    """Return the same as people read it.
+
+    >>> owners_in_words("random_threshold"), owners_in_words("idle_humans_teleoperate")
+    ('random', 'cur and other orders with c')
+    """
+    found = owners(name)
+    others = [algorithm for algorithm in found if algorithm not in ORDERS_WITH_C]
+    return ", ".join([*others, *(["cur and other orders with c"] if len(others) < len(found) else [])])

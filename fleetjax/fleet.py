@@ -1,7 +1,7 @@
 """The fleet's timestep: signals, priorities, allocation, actions, physics, data, resets, learning (paper, Section 3).
 
-`Fleet.plan` says who needs whom, `Fleet.advance` does the rest, and `Fleet.step` puts the simulated supervisor between
-them. This is the only module that maps over robots.
+`Fleet.plan` says which human helps which robot, `Fleet.advance` does the rest, and `Fleet.step` puts the simulated supervisor
+between them. This module maps environment, supervisor and physics over the robots.
 """
 
 import dataclasses
@@ -231,7 +231,10 @@ def reset_robots(parts: Parts, keys: jax.Array) -> EnvState:
 
 def step_robots(parts: Parts, env: EnvState, action: jax.Array, moving: jax.Array, keys: Keys) -> tuple[EnvState, jax.Array]:
     """Step the robots that move; return EnvState[N], and bool[N] whose numbers are finite. The others are in violation."""
-    stepped = where(moving, jax.vmap(parts.env.step)(env, action, moving, keys.env), env)
+    stepped = jax.vmap(parts.env.step)(env, action, moving, keys.env)
+    if parts.env.spec.success_return is not None:
+        stepped = stepped._replace(success=stepped.timeout & (stepped.episode_return > parts.config.success_return))
+    stepped = where(moving, stepped, env)
     sound = finite((env.obs, action, stepped.obs, stepped.reward))
     return contain(stepped, sound), sound
 

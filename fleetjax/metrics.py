@@ -1,4 +1,4 @@
-"""What a timestep is worth: counts over the fleet, and the return on human effort (paper, Sections 3 and 5.1)."""
+"""What is counted in a timestep, and the return on human effort (paper, Sections 3 and 5.1)."""
 
 from typing import NamedTuple
 
@@ -76,7 +76,7 @@ def rohe(metrics: Metrics, config: Config, time_unit: float = 100) -> jax.Array:
 
 
 def first_divergence(metrics: Metrics) -> tuple[int, tuple[str, ...]] | None:
-    """Return the first timestep after which something learnt was not finite, and what; None if all was always finite.
+    """Return the first timestep with NaN or infinity in something learnt, and its names; None if there was none.
 
     Args:
         metrics: counts [T] of one run, as they come out of it.

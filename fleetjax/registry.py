@@ -33,7 +33,7 @@ class Registry(Generic[Entry]):
             ValueError: if the name is taken.
         """
         if name in self.entries:
-            raise ValueError(f"{self.kind} = {name!r} is registered already; choose another name")
+            raise ValueError(f"{self.kind} = {name!r} is already registered; choose another name")
         self.entries[name] = entry
 
     def get(self, name: str) -> Entry:

@@ -51,7 +51,8 @@ class Signals(NamedTuple):
     Attributes:
         violation: bool[N] the constraint indicator c(s).
         uncertainty: f32[N] disagreement of the policy ensemble, in [0, 1]; entropy in nats where actions are discrete.
-        risk: f32[N] probability of a constraint violation by the safety critic; 0 without one.
+        risk: f32[N] the safety critic's estimate, in [0, 1], of how near a violation is: discounted, and higher than the true
+            probability; 0 without one.
         goal: f32[N] probability of success by the goal critic; 0 without one.
         timestep: i32[] timesteps since the fleet started.
         estimates: f32[N] of each estimator that the algorithm names, by name.
@@ -62,7 +63,7 @@ class Signals(NamedTuple):
         correction: f32[N] mean squared difference between the human's and the robot's action, if the robot was teleoperated
             at the last timestep; else 0.
         human_action: f32[N, A] what the supervisor would do; None unless the algorithm has `sees_supervisor`.
-        link: f32[N] how well each robot can be reached; 1 for all.
+        link: f32[N] quality of the connection to each robot; always 1 so far.
     """
 
     violation: jax.Array
@@ -81,7 +82,7 @@ class Signals(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """Who needs whom at this timestep.
+    """Which human helps which robot at this timestep.
 
     Attributes:
         signals: Signals[N] that the scores were made from.

@@ -51,6 +51,16 @@ def make_metrics(seed: int = 0, steps: int = 40) -> Metrics:
     return Metrics(**counts | {name: rng.normal(size=steps).astype(np.float32) for name in metrics_csv.REALS})
 
 
+def write_run(path: Path, config: Config, seed: int, metrics: Metrics) -> Path:
+    """Write the folder of a run that ended with these Metrics[T], and return it."""
+    path.mkdir(parents=True)
+    log = metrics_csv.open_log(path)
+    metrics_csv.append(log, metrics, 0)
+    log.close()
+    folder.write_config(folder.Run(path, config, seed), sealed=True)
+    return path
+
+
 def shapes_of(config: Config) -> FleetState:
     """Return shapes and types of the state of a registered environment's fleet."""
     return checks.state_shapes(config, envs.make(config.environment, config.backend))

@@ -26,29 +26,29 @@ class Robot(NamedTuple):
 
     Attributes:
         module: where it is.
-        control: `(action, model) -> controls`, what the environment makes of actions.
+        control: `(EnvState[K], actions [K, A], model) -> controls`, what the environment makes of actions.
         body: `EnvState.physics -> PhysicsState`.
         noise: largest standard deviation of the noise on actions.
-        under_expert: noise on the expert's actions; else on the last action, so that servos wander.
+        under_expert: noise on the expert's actions; else noise alone, so that servos wander.
     """
 
     module: Any
-    control: Callable[[jax.Array, mujoco.MjModel], jax.Array]
+    control: Callable[[EnvState, jax.Array, mujoco.MjModel], jax.Array]
     body: Callable[[Any], PhysicsState]
     noise: float
     under_expert: bool = True
 
 
+def hold(state: EnvState, action: jax.Array, model: mujoco.MjModel) -> jax.Array:
+    """Return the angles [K, 16] that the hand's servos are told to hold."""
+    target = jnp.clip(state.physics.target + allegro_hand.LARGEST_CHANGE * action, -1.0, 1.0)
+    return allegro_hand.angles(target, *jnp.float32(model.jnt_range[:16].T))
+
+
 ROBOTS = {
-    "humanoid": Robot(humanoid, lambda action, model: action, lambda physics: physics, 1.0),
-    "anymal": Robot(anymal, lambda action, model: anymal.targets(action), lambda physics: physics.body, 3.0),
-    "allegro_hand": Robot(
-        allegro_hand,
-        lambda action, model: allegro_hand.targets(action, *jnp.float32(model.jnt_range[:16].T)),
-        lambda physics: physics.body,
-        0.3,
-        under_expert=False,
-    ),
+    "humanoid": Robot(humanoid, lambda state, action, model: action, lambda physics: physics, 1.0),
+    "anymal": Robot(anymal, lambda state, action, model: anymal.targets(action), lambda physics: physics.body, 3.0),
+    "allegro_hand": Robot(allegro_hand, hold, lambda physics: physics.body, 1.0, under_expert=False),
 }
 
 
@@ -62,7 +62,7 @@ def make_policy(name: str, env: Env, num_robots: int):
         if supervisor:
             action = jax.vmap(supervisor.act)(state, jax.random.split(key_act, num_robots))
         else:
-            action = state.obs[:, -env.spec.action_size :]
+            action = jnp.zeros((num_robots, env.spec.action_size))
         return jnp.clip(action + scale * jax.random.normal(key_noise, action.shape), -1.0, 1.0)
 
     return act
@@ -83,8 +83,8 @@ def wander(name: str, key: jax.Array):
 
     states, actions = jax.jit(lambda s, k: jax.lax.scan(step, s, k)[1])(start, jax.random.split(key_steps, NUM_STEPS))
     moving = ~np.asarray(states.violation)
-    bodies = jax.tree.map(lambda x: np.asarray(x)[moving], ROBOTS[name].body(states.physics))
-    return bodies, np.asarray(ROBOTS[name].control(actions[moving], physics_of(name).model))
+    states, actions = jax.tree.map(lambda x: np.asarray(x)[moving], (states, actions))
+    return ROBOTS[name].body(states.physics), np.asarray(ROBOTS[name].control(states, actions, physics_of(name).model))
 
 
 def physics_of(name: str, backend: str = "native") -> Physics:

@@ -96,7 +96,7 @@ def test_unknown_brax_environment():
 
 def test_playground_missing(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco_playground", None)
-    with pytest.raises(ImportError, match=r'pip install "fleetjax\[playground\]"'):
+    with pytest.raises(ImportError, match=r'run pip install "\.\[playground\]" in the source folder'):
         envs.from_playground("CartpoleBalance", supervisor="balance")
 
 

@@ -44,10 +44,22 @@ def scalar_first(rotation):
 NO_TURN, STILL = (1, 0, 0, 0), (0, 0, 0)
 
 
-def hand(physics, *, angles=0.0, speeds=0.0, position=(0, -0.2, 0.52), turn=NO_TURN, velocity=STILL, spin=STILL, goal=NO_TURN):
+def hand(
+    physics,
+    *,
+    angles=0.0,
+    speeds=0.0,
+    position=(0, -0.2, 0.52),
+    turn=NO_TURN,
+    velocity=STILL,
+    spin=STILL,
+    goal=NO_TURN,
+    target=0.0,
+):
     qpos = jnp.concatenate([jnp.asarray(x, jnp.float32) for x in (np.broadcast_to(angles, 16), position, turn)])
     qvel = jnp.concatenate([jnp.asarray(x, jnp.float32) for x in (np.broadcast_to(speeds, 16), velocity, spin)])
-    return allegro_hand.Hand(physics.initial._replace(qpos=qpos, qvel=qvel), jnp.asarray(goal, jnp.float32))
+    body = physics.initial._replace(qpos=qpos, qvel=qvel)
+    return allegro_hand.Hand(body, jnp.asarray(goal, jnp.float32), jnp.broadcast_to(jnp.float32(target), 16))
 
 
 # The model
@@ -108,13 +120,13 @@ def test_spec(env, physics):
 
 
 def test_observation_at_rest(physics):
-    action = -(HIGH + LOW) / (HIGH - LOW)  # targets at zero: no torque
-    obs = allegro_hand.observe(hand(physics), action, LOW, HIGH)
+    target = -(HIGH + LOW) / (HIGH - LOW)  # angles of zero: no torque
+    obs = allegro_hand.observe(hand(physics, target=target), LOW, HIGH)
     expected = np.zeros(88)
     expected[:16] = np.array(3 * [0, -0.7217, -0.7217, -0.7217] + [-1.4324, -0.5529, -0.7217, -0.7265])
     expected[48:51] = expected[61:64] = 0, -0.2, 0.52
     expected[[54, 67, 71]] = 1
-    expected[72:] = action
+    expected[72:] = target
     np.testing.assert_allclose(obs, expected, atol=1e-4)
 
 
@@ -125,7 +137,7 @@ def test_observation_of_motion_and_orientation(physics):
         physics, angles=np.full(16, 0.5), speeds=speeds, position=(0.01, -0.18, 0.55), turn=scalar_first(cube),
         velocity=(0.3, -0.2, 0.1), spin=spin, goal=scalar_first(goal),
     )  # fmt: skip
-    obs = allegro_hand.observe(moving, jnp.zeros(16), LOW, HIGH)
+    obs = allegro_hand.observe(moving, LOW, HIGH)
     low, high = LIMITS.T
     torques = np.clip(3 * ((low + high) / 2 - 0.5) - 0.1 * speeds, -0.5, 0.5)
     np.testing.assert_allclose(obs[:16], (1 - high - low) / (high - low), atol=1e-5)
@@ -152,7 +164,7 @@ def test_episodes_start_at_rest_with_the_cube_in_the_hand(env, physics):
     held = jax.jit(jax.vmap(env.step, in_axes=(0, 0, None, None)))
     after = state
     for _ in range(15):  # half a second
-        after = held(after, state.obs[:, 72:], True, jax.random.key(0))
+        after = held(after, jnp.zeros((64, 16)), True, jax.random.key(0))
     moved = np.linalg.norm(np.asarray(after.physics.body.qpos[:, 16:19]) - qpos[:, 16:19], axis=1)
     assert np.median(moved) < 5e-3
     assert not after.violation.any()
@@ -171,7 +183,7 @@ def test_goals_are_two_turns():
 def test_reward_far_from_the_goal(env, step, start):
     action = jnp.linspace(-2, 2, 16)
     after = step(start, action)
-    body, goal = after.physics
+    body, goal, _ = after.physics
     angle = (Rotation.from_quat(np.roll(body.qpos[19:23], -1)) * Rotation.from_quat(np.roll(goal, -1)).inv()).magnitude()
     assert angle > 0.1
     distance = np.linalg.norm(np.asarray(body.qpos[16:19]) - (0, -0.2, 0.52))
@@ -186,7 +198,7 @@ def test_a_goal_is_reached_within_a_tenth_of_a_radian(env, step, start, turn, re
     near = Rotation.from_rotvec([0, 0, turn]) * Rotation.from_quat(np.roll(body.qpos[19:23], -1))
     sign = -1 if reached else 1  # the same orientation has two quaternions
     goal = jnp.asarray(sign * scalar_first(near), jnp.float32)
-    after = step(start._replace(physics=start.physics._replace(goal=goal)), start.obs[72:])
+    after = step(start._replace(physics=start.physics._replace(goal=goal)), jnp.zeros(16))
     assert bool(after.success) == reached
     assert (after.reward > 200) == reached
     fresh = env.next_goal(after, jax.random.key(1))
@@ -201,20 +213,26 @@ def test_a_goal_is_reached_within_a_tenth_of_a_radian(env, step, start, turn, re
 def test_a_dropped_cube_is_a_violation(step, start, distance, dropped):
     body = start.physics.body
     away = body.qpos.at[16:19].set(jnp.array([0, -0.2 - distance, 0.52]))
-    after = step(start._replace(physics=start.physics._replace(body=body._replace(qpos=away))), start.obs[72:])
+    after = step(start._replace(physics=start.physics._replace(body=body._replace(qpos=away))), jnp.zeros(16))
     assert bool(after.violation) == dropped
     assert not after.success
 
 
-def test_an_action_sets_targets_between_the_limits(physics, step, start):
+def test_an_action_changes_targets_between_the_limits(physics, step, start):
+    """By .3 of half a joint's range at most; the observation tells where they are."""
     action = jnp.linspace(-1.5, 1.5, 16)
-    after = step(start, action)
-    data = mujoco.MjData(physics.model)
-    data.qpos[:] = start.physics.body.qpos
     low, high = LIMITS.T
-    data.ctrl[:] = low + (np.clip(action, -1, 1) + 1) / 2 * (high - low)
-    mujoco.mj_step(physics.model, data, 4)
-    np.testing.assert_allclose(after.physics.body.qpos, data.qpos, atol=1e-5)
+    state, data = start, mujoco.MjData(physics.model)
+    data.qpos[:] = state.physics.body.qpos
+    target = np.asarray(state.physics.target)
+    np.testing.assert_allclose(target, np.clip(2 * (data.qpos[:16] - low) / (high - low) - 1, -1, 1), atol=1e-5)
+    for _ in range(7):
+        state, target = step(state, action), np.clip(target + 0.3 * np.clip(action, -1, 1), -1, 1)
+        data.ctrl[:] = low + (target + 1) / 2 * (high - low)
+        mujoco.mj_step(physics.model, data, 4)
+        np.testing.assert_allclose(state.obs[72:], target, atol=1e-6)
+    np.testing.assert_allclose(state.physics.body.qpos[:16], data.qpos[:16], atol=1e-2)
+    np.testing.assert_array_equal(target[[0, -1]], [-1, 1])
 
 
 # What the expert sees
@@ -226,10 +244,17 @@ def turned(physics):
     cube, goal = Rotation.random(rng=np.random.default_rng(1)), Rotation.random(rng=np.random.default_rng(2))
     angles = np.linspace(0.3, 0.6, 16)
     hands = [
-        hand(physics, angles=angles, speeds=0.5, turn=scalar_first(cube * same), goal=scalar_first(goal * same))
+        hand(
+            physics,
+            angles=angles,
+            speeds=0.5,
+            turn=scalar_first(cube * same),
+            goal=scalar_first(goal * same),
+            target=jnp.linspace(-1, 1, 16),
+        )
         for same in Rotation.create_group("O")
     ]
-    return cube, goal, np.stack([allegro_hand.observe(h, jnp.linspace(-1, 1, 16), LOW, HIGH) for h in hands])
+    return cube, goal, np.stack([allegro_hand.observe(h, LOW, HIGH) for h in hands])
 
 
 def test_the_view_is_the_same_for_a_cube_turned_onto_itself(turned):
@@ -268,5 +293,5 @@ def test_the_view_entry_by_entry(turned):
 
 
 def test_the_view_at_the_goal_is_finite(physics):
-    obs = allegro_hand.observe(hand(physics, turn=NO_TURN, goal=NO_TURN), jnp.zeros(16), LOW, HIGH)
+    obs = allegro_hand.observe(hand(physics), LOW, HIGH)
     np.testing.assert_allclose(allegro_hand.view(obs)[62:69], 0, atol=1e-6)

@@ -94,8 +94,11 @@ def test_other_commands_refuse_in_one_line(arguments, reason, capsys):
         ("num_demonstrations", np.int64(2**32 + 500), "num_demonstrations = 4294967796 must lie within 32 bits"),
         ("num_demonstrations", np.array([500, 2**32 + 500]), "must lie within 32 bits"),
         ("num_demonstrations", 16777217.0, "num_demonstrations = 16777217.0 is a float beyond 2.24.*pass an int"),
-        ("num_demonstrations", 500.5, "num_demonstrations = 500.5 must be a whole number of pairs"),
+        ("num_demonstrations", 500.5, "num_demonstrations = 500.5 must be a whole number$"),
         ("num_demonstrations", np.nan, "must be a whole number"),
+        ("min_teleop_time", 0.5, "min_teleop_time = 0.5 must be a whole number of timesteps"),
+        ("num_robots", 2.5, "num_robots = 2.5 must be a whole number"),
+        ("hidden_sizes", 64, "hidden_sizes = 64 must be a list of whole numbers"),
         ("num_demonstrations", True, "num_demonstrations = True must be a number"),
         ("learning_rate", 1j, "learning_rate = 1j must be a number"),
         ("learning_rate", None, "learning_rate = None must be a number"),
@@ -123,7 +126,7 @@ def test_a_supervisor_whose_actions_have_another_size_is_refused(monkeypatch):
 
 def test_a_run_that_cannot_fit_the_memory_is_refused_with_both_numbers(monkeypatch):
     config = fleetjax.make_config("navigation", "cur", critic_capacity=1_000_000)
-    needed = r"critic_capacity = 1000000 is too large: the run needs at least 0\.0[1-9] GiB of memory, 0\.0[1-9] .* only 0\.00"
+    needed = r"critic_capacity = 1000000 is too large: .* 0\.0[1-9] GiB of memory \(0\.0[1-9] GiB for .* only 0\.00 GiB"
     monkeypatch.setattr(checks, "_memory", lambda: 1000)
     with pytest.raises(ValueError, match=needed):
         jax.eval_shape(fleetjax.run, config, jax.random.key(0))

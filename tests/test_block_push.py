@@ -172,7 +172,7 @@ def test_the_teacher_reaches_goal_after_goal_without_a_violation(env):
 @pytest.mark.slow
 def test_what_the_teacher_shows_is_learnt_from_images():
     """A policy of chance reaches none of these goals: see the second half."""
-    config = fleetjax.make_config("block_push", "constraint", num_steps=60, num_robots=24, pretraining_steps=300)
+    config = fleetjax.make_config("block_push", "constraint", num_steps=60, num_robots=24, pretraining_steps=1500)
     config = config.replace(extra_demonstrations=0)
     state = jax.jit(fleetjax.prepare)(config, jax.random.key(0))
     pairs = state.human_data.pairs
@@ -181,5 +181,5 @@ def test_what_the_teacher_shows_is_learnt_from_images():
     learnt = jax.jit(fleetjax.evaluate)(config, jax.random.key(1), state.policy).metrics
     chance = state.policy._replace(params=jax.tree.map(jnp.zeros_like, state.policy.params))
     none = jax.jit(fleetjax.evaluate)(config, jax.random.key(1), chance).metrics
-    assert int(learnt.successes.sum()) > 24
+    assert int(learnt.successes.sum()) > 24  # about 50
     assert int(none.successes.sum()) < 12

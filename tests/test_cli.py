@@ -116,7 +116,7 @@ def test_evaluation_is_the_librarys(copied, capsys):
     assert printed.out.splitlines()[-1].split() == ["C.U.R.", *totals]
     assert "ROHE" not in printed.err
     before = contents(copied)
-    assert "evaluation.json exists already" in refused(capsys, "evaluate", copied)
+    assert "evaluation.json already exists" in refused(capsys, "evaluate", copied)
     assert contents(copied) == before
     assert cli.main(["evaluate", str(copied), "--num-steps", "16", "--overwrite"]) == 0
     assert json.loads((copied / "evaluation.json").read_text())["seed"] == 4  # not the training's 3
@@ -136,7 +136,7 @@ def test_an_output_that_is_a_link_counts_and_its_target_is_written(copied, tmp_p
     target.parent.mkdir()
     link.symlink_to(target)
     for _ in range(2):  # a dangling link, then one that leads to a file
-        assert f"{link} exists already" in refused(capsys, "plot", copied, "--output", link)
+        assert f"{link} already exists" in refused(capsys, "plot", copied, "--output", link)
         assert cli.main(["plot", str(copied), "--output", str(link), "--overwrite"]) == 0
         assert capsys.readouterr().out == f"{link}\n"
         assert link.readlink() == target
@@ -193,11 +193,11 @@ RUN = ("run", "navigation")
 
 def test_existing_folders_and_files_are_not_overwritten(copied, tmp_path, capsys):
     before = contents(copied)
-    assert "exists already" in refused(capsys, *RUN, *TINY, "--output", copied)
+    assert "already exists" in refused(capsys, *RUN, *TINY, "--output", copied)
     file = tmp_path / "figure.png"
     file.write_text("precious")
-    assert "exists already" in refused(capsys, *RUN, "--output", file)
-    assert "exists already" in refused(capsys, "plot", copied, "--output", file)
+    assert "already exists" in refused(capsys, *RUN, "--output", file)
+    assert "already exists" in refused(capsys, "plot", copied, "--output", file)
     assert "is not a run folder" in refused(capsys, *RUN, "--output", file, "--overwrite")
     assert file.read_text() == "precious"
     assert contents(copied) == before

@@ -8,6 +8,8 @@ import os
 import signal
 import socket
 import threading
+from types import SimpleNamespace
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +21,7 @@ from websockets.sync.client import connect
 
 import fleetjax
 from fleetjax import cli, envs
-from fleetjax.console import controls, engine, guard, messages, record, seats
+from fleetjax.console import controls, engine, guard, messages, pages, record, seats
 from fleetjax.console.engine import EMPTY, PERSON, SIMULATED, Engine, Inputs, View
 from fleetjax.io import files, folder, metrics_csv
 
@@ -51,6 +53,27 @@ def crash(fleet: Engine, *robots: int) -> None:
     violation = np.array(fleet.state.env.violation)
     violation[list(robots)] = True
     fleet.state = fleet.state._replace(env=fleet.state.env._replace(violation=jnp.asarray(violation)))
+
+
+# Why a robot has help
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "limits", "why"),
+    [
+        ("cur", [0.01, 0.3], "uncertainty and risk above the threshold"),
+        ("rc", [None, 0.3], "risk above the threshold"),
+        ("ensemble_dagger", [0.01], "uncertainty above the threshold"),
+        ("random", [None], "highest priority"),
+    ],
+)
+def test_only_thresholds_that_the_rule_uses_are_named(algorithm, limits, why):
+    config = make_config(algorithm=algorithm, uncertainty_threshold=0.01, risk_threshold=0.3)
+    high, none = np.full(4, 0.5, np.float32), np.zeros(4, bool)
+    view = View(0, np.array([2, -1]), np.zeros(2, int), none, none, high, high, high, high)
+    seen = pages.operator(cast(Any, SimpleNamespace(config=config)), view, 0, seats.Seat("key", robot=2), {})
+    assert seen["why"] == why
+    assert [signal["threshold"] for signal in seen["signals"]] == pytest.approx(limits)
 
 
 # The engine
@@ -161,7 +184,7 @@ def test_seats_are_taken_in_order_or_by_wish_and_only_once(table):
         table.claim("b", 0.0, seat=1)
     with pytest.raises(seats.Refused, match="no seat 8"):
         table.claim("b", 0.0, seat=7)
-    with pytest.raises(seats.Refused, match="you have a seat already"):
+    with pytest.raises(seats.Refused, match="you already have a seat"):
         table.claim("a", 0.0)
     assert table.claim("b", 0.0)[0] == 0
     with pytest.raises(seats.Refused, match="every seat is taken"):
@@ -183,7 +206,7 @@ def test_the_key_of_another_seat_gives_nobody_a_second_one(table):
     _, first, _ = table.claim("a", 0.0)
     second, key, _ = table.claim("b", 0.0)
     for gone in (False, True):
-        with pytest.raises(seats.Refused, match="you have a seat already"):
+        with pytest.raises(seats.Refused, match="you already have a seat"):
             table.claim("b", 1.0, key=first)
         if not gone:
             table.drop("a", 1.0)
@@ -193,7 +216,7 @@ def test_the_key_of_another_seat_gives_nobody_a_second_one(table):
     with pytest.raises(seats.Refused, match="every seat is taken"):
         table.claim("a", 3.0)
     table.leave("b")
-    with pytest.raises(seats.Refused, match="you have a seat already"):
+    with pytest.raises(seats.Refused, match="you already have a seat"):
         table.claim("reloaded", 4.0, key=key)
     assert [seat.client for seat in table.seats] == ["reloaded", None]
 
@@ -400,7 +423,7 @@ def test_environments_without_controls_are_refused(capsys, monkeypatch):
 def test_a_missing_web_server_is_named(missing, capsys, monkeypatch):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == missing else find(name, *rest))
-    assert 'pip install "fleetjax[console]"' in refused(capsys, "console", "navigation", "--humans", "2")
+    assert 'run pip install ".[console]" in the source folder' in refused(capsys, "console", "navigation", "--humans", "2")
 
 
 def test_a_port_in_use_and_a_folder_in_use_are_refused(capsys, tmp_path):
@@ -416,7 +439,7 @@ def test_a_port_in_use_and_a_folder_in_use_are_refused(capsys, tmp_path):
     console = ("console", "navigation", "--port", "0", "--output", tmp_path / "run")
     assert "is not a run folder" in refused(capsys, *console, "--overwrite")
     (tmp_path / "run" / "config.json").touch()
-    assert "exists already" in refused(capsys, *console)
+    assert "already exists" in refused(capsys, *console)
     with files.lock(tmp_path / "run"):
         said = refused(capsys, *console, "--overwrite")
     assert "is in use by process" in said

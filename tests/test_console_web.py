@@ -357,7 +357,7 @@ def test_a_page_with_a_seat_gets_no_other_by_its_key(served):
     with served.page() as page, served.page() as other:
         key, mine = claim(page)["key"], claim(other)
         answer = claim(other, key=key)
-        assert (answer["type"], answer["reason"], answer["free"]) == ("taken", "you have a seat already", [])
+        assert (answer["type"], answer["reason"], answer["free"]) == ("taken", "you already have a seat", [])
         assert claim(other, key=mine["key"], seat=0) == mine
         assert claim(page, key=key, seat=1)["seat"] == 0
 
@@ -504,6 +504,7 @@ def test_two_people_reset_one_robot_and_drive_another_to_its_goal(session, brows
         for page in pages:
             page.wait_for_function("() => document.getElementById('seat').textContent.startsWith('Seat ')")
         assert sorted(page.text_content("#seat") for page in pages) == ["Seat 1", "Seat 2"]
+        fleet.wait_for_function("() => document.getElementById('seats').textContent.includes('robot 0 waits for R')")
         assert sum(m.hard_resets[0] for m in session.metrics) == 0
         served.console.options = served.console.options._replace(interval=0.1)
         resetting.keyboard.press("r")

@@ -97,7 +97,7 @@ def test_a_run_longer_than_its_state_has_room_for_is_refused_even_when_traced(co
 @pytest.mark.parametrize("name", ["num_demonstrations", "extra_demonstrations"])
 def test_a_swept_number_of_demonstrations_needs_a_capacity(config, name):
     numbers = jnp.array([25, 60])
-    with pytest.raises(ValueError, match=f"{name} is traced.*pass human_capacity"):
+    with pytest.raises(ValueError, match=f"{name} is traced. Also pass human_capacity: .* times augmented_copies, plus 60"):
         jax.vmap(lambda n: config.replace(**{name: n}))(numbers)
     explicit = jax.vmap(lambda n: config.replace(**{name: n}, human_capacity=200))(numbers)
     assert explicit.human_capacity == 200
@@ -130,6 +130,15 @@ def test_capacity_follows_the_other_fields_unless_it_is_given(config):
     assert jax.eval_shape(lambda c: c.replace(num_steps=100), config).human_capacity == 220
 
 
+def test_a_capacity_that_is_given_does_not_grow_unasked(config):
+    assert fleetjax.make_config("navigation", "uc", **SMALL, human_capacity=80).human_capacity == 80
+    with pytest.raises(ValueError, match=r"human_capacity = 3 is less than the 80 pairs .* omit it, or pass at least 80"):
+        fleetjax.make_config("navigation", "uc", **SMALL, human_capacity=3)
+    with pytest.raises(ValueError, match=r"human_capacity = 3 .* pass at least 80"):
+        fleetjax.validate(config.replace(human_capacity=3))
+    assert config.replace(human_capacity=100).replace(num_steps=100).human_capacity == 220  # a longer run needs more
+
+
 def test_extend_takes_several_fleets_and_refuses_nonsense(config):
     several = jax.eval_shape(lambda keys: jax.vmap(lambda k: fleetjax.prepare(config, k))(keys), jax.random.split(KEY, 3))
     rows = jax.eval_shape(lambda s: fleetjax.extend(s, 5), several).human_data
@@ -149,6 +158,7 @@ def test_extend_takes_several_fleets_and_refuses_nonsense(config):
         ("block_push", "uc", {}, "environment = 'block_push', but the state was prepared for 'navigation'"),
         ("navigation", "cur", {}, "algorithm = 'cur' keeps other estimators or another memory than 'uc'"),
         ("navigation", "thrifty_dagger", {}, "algorithm = 'thrifty_dagger' keeps other estimators or another memory than 'uc'"),
+        ("navigation", "uc", {"hidden_sizes": (4, 4)}, r"another structure .*\(hidden_sizes, estimators\); call prepare with"),
         ("navigation", "uc", {"hidden_sizes": (5,)}, r"its \.policy\.params.*float32\[2, 4\]; expected float32\[2, 5\]"),
     ],
 )

@@ -476,7 +476,7 @@ def test_without_interventions_nothing_is_written(kind, tmp_path):
 def test_a_missing_library_is_named_with_the_remedy(kind, name, monkeypatch, tmp_path):
     formats.check(kind)
     monkeypatch.setitem(sys.modules, name, None)
-    reason = rf'--format {kind} needs {name}: pip install "fleetjax\[{kind}\]"'
+    reason = rf'--format {kind} needs {name}; run pip install "\.\[{kind}\]" in the source folder'
     with pytest.raises(ValueError, match=reason):
         formats.check(kind)
     with pytest.raises(ValueError, match=reason):

@@ -8,6 +8,7 @@ import pytest
 from commands import make_metrics
 
 import fleetjax
+from fleetjax import statistics
 from fleetjax.io import figure, text
 from fleetjax.io.progress import progress
 from fleetjax.metrics import Metrics
@@ -55,15 +56,27 @@ def test_labels_tell_settings_apart_and_rows_tell_environments_apart(config):
     assert [entry.get_text() for entry in drawn.legends[0].get_texts()] == names
 
 
-def test_the_band_is_one_standard_deviation_about_the_mean(config):
-    runs = [(config, seed, make_metrics(seed)) for seed in range(3)]
-    axes = figure.draw(figure.group(runs)).axes
-    successes = np.array([np.cumsum(make_metrics(seed).successes) for seed in range(3)])
-    mean, deviation = successes.mean(axis=0), successes.std(axis=0, ddof=1)
-    np.testing.assert_allclose(axes[0].lines[0].get_ydata(), mean)
-    band = axes[0].collections[0].get_paths()[0].vertices
-    assert band[:, 1].max() == pytest.approx((mean + deviation).max())
-    assert [ax.get_title(loc="left") for ax in axes] == list(figure.PANELS)
+@pytest.mark.parametrize(("seeds", "kind"), [(3, "range"), (6, "95 % interval")])
+def test_lines_are_means_in_a_band(config, seeds, kind):
+    drawn = figure.plot([(config, seed, make_metrics(seed)) for seed in range(seeds)])
+    successes = np.array([np.cumsum(make_metrics(seed).successes) for seed in range(seeds)])
+    mean, (low, high) = successes.mean(axis=0), statistics.mean_bounds(successes, 1000)
+    np.testing.assert_allclose(drawn.axes[0].lines[0].get_ydata(), mean)
+    assert np.all(low <= mean)
+    band = drawn.axes[0].collections[0].get_paths()[0].vertices
+    for t in (1, 20, STEPS):
+        np.testing.assert_allclose(np.unique(band[band[:, 0] == t, 1])[[0, -1]], [low[t - 1], high[t - 1]])
+    assert (low[-1] == successes[:, -1].min()) == (kind == "range")
+    assert [ax.get_title(loc="left") for ax in drawn.axes] == list(figure.PANELS)
+    assert drawn.legends[0].get_title().get_text() == f"navigation: mean of {seeds} seeds, band: {kind}"
+
+
+def test_the_legend_tells_what_each_band_is(config):
+    rule = fleetjax.make_config("navigation", "uc")
+    runs = [(config, seed, make_metrics(seed)) for seed in range(5)] + [(rule, seed, make_metrics(seed)) for seed in range(2)]
+    legend = figure.plot(runs).legends[0]
+    assert legend.get_title().get_text() == "navigation: mean, band: 95 % interval, range below 5 seeds"
+    assert [entry.get_text() for entry in legend.get_texts()] == ["C.U.R. (5 seeds)", "U.C. (2 seeds)"]
 
 
 def test_returns_of_different_size_are_told_apart(config):

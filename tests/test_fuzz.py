@@ -99,7 +99,7 @@ SHAPES = [
     ("cur", {"num_robots": 5, "num_humans": 2}),
     ("thrifty_dagger", {"num_robots": 6, "num_humans": 6, "critic_capacity": 6, "ensemble_size": 1}),
     ("random", {"num_robots": 8, "num_humans": 3, "gradient_steps": 2, "hidden_sizes": (3, 2)}),
-    ("constraint", {"num_robots": 1, "num_humans": 1}),
+    ("constraint", {"num_robots": 1, "num_humans": 1, "extra_demonstrations": 0}),
 ]
 T, SETTINGS = 40, 64
 LARGEST = {  # where a field's own limits allow what takes too long, or more data than there is room for

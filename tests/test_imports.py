@@ -41,7 +41,7 @@ def run_fresh(program: str) -> str:
 
 
 @pytest.mark.parametrize(
-    "command", ["--help", "--version", "run --help", "run humanoid --help", "run navigation --num-robot 4", ""]
+    "command", ["--help", "--version", "run --help", "run humanoid --help", "sweep --help", "run navigation --num-robot 4", ""]
 )
 def test_help_and_refused_flags_load_no_jax(command):
     program = f"""

@@ -110,9 +110,9 @@ def edit(path: Path, old: str, new: str) -> None:
 
 DAMAGES = {
     "no folder": (lambda run: [path.unlink() for path in run.iterdir()] and run.rmdir(), "it does not exist"),
-    "no config": (lambda run: (run / "config.json").unlink(), "config.json is missing"),
+    "no config": (lambda run: (run / "config.json").unlink(), "config.json is missing, so this is not a run folder"),
     "no metrics": (lambda run: (run / "metrics.csv").unlink(), "metrics.csv is missing"),
-    "no policy": (lambda run: (run / "policy.msgpack").unlink(), "policy.msgpack is missing"),
+    "no policy": (lambda run: (run / "policy.msgpack").unlink(), "policy.msgpack is missing, so the run did not finish"),
     "policy cut": (lambda run: (run / "policy.msgpack").write_bytes(b"\x82\xa6params"), "SHA-256"),
     "bit in policy": (lambda run: flip(run / "policy.msgpack"), "SHA-256"),
     "bit in metrics": (lambda run: flip(run / "metrics.csv"), "SHA-256"),
@@ -250,7 +250,7 @@ def test_only_a_run_is_overwritten(saved, tmp_path):
     (tmp_path / "mine" / "notes.txt").write_text("mine")
     for path in (tmp_path / "mine", tmp_path / "mine" / "notes.txt"):
         for overwrite in (False, True):
-            with pytest.raises(FileExistsError, match="exists already and is not a run folder"):
+            with pytest.raises(FileExistsError, match="already exists and is not a run folder"):
                 folder.check_folder(path, overwrite=overwrite)
     with pytest.raises(FileExistsError, match="--overwrite"):
         folder.check_folder(saved, overwrite=False)

@@ -19,6 +19,17 @@ NUM_ROBOTS = 32  # of every batch, so that MJX compiles once
 BACKENDS = ("native", "mjx")
 QUICK = "anymal"  # MJX takes long to compile a robot, and this one least of all: the others are among the slow tests
 
+
+def test_a_model_of_ones_own_is_loaded_by_its_absolute_path(tmp_path):
+    joint = '<body><joint type="slide"/><geom size="0.1"/></body>'
+    option = '<option timestep="0.01"><flag eulerdamp="disable"/></option>'
+    path = tmp_path / "slide.xml"
+    path.write_text(f"<mujoco>{option}<worldbody>{joint}</worldbody></mujoco>")
+    physics = make_physics(str(path), substeps=3, backend="native")
+    assert physics.model.nq == 1
+    assert physics.control_step == pytest.approx(0.03)
+
+
 each_robot = pytest.mark.parametrize("name", ROBOTS)
 each_robot_and_backend = pytest.mark.parametrize(
     ("name", "backend"),

@@ -30,15 +30,18 @@ all_signals = st.tuples(flags, columns, columns, columns, timesteps).map(lambda 
 
 @functools.cache
 def scorer(name: str):
-    """Return a compiled `(Signals, aux) -> (score, aux)`."""
-    rule = priority.get_algorithm(name).make_priority(CONFIG.replace(algorithm=name))
-    return compiled(lambda signals, aux: rule.score(signals, aux, jax.random.key(0)))
+    """Return a compiled `(Config, Signals) -> score` of a first timestep."""
+
+    def first(config, signals):
+        rule = priority.get_algorithm(name).make_priority(config)
+        return rule.score(signals, rule.init(), jax.random.key(0))[0]
+
+    return compiled(first)
 
 
-def score(name: str, signals: Signals) -> np.ndarray:
+def score(name: str, signals: Signals, **parameters) -> np.ndarray:
     """Return scores[N] of a first timestep."""
-    aux = priority.get_algorithm(name).make_priority(CONFIG.replace(algorithm=name)).init()
-    return np.asarray(scorer(name)(signals, aux)[0])
+    return np.asarray(scorer(name)(CONFIG.replace(algorithm=name, **parameters), signals))
 
 
 def thresholded(values: np.ndarray, threshold: float) -> list[float]:
@@ -63,6 +66,16 @@ def test_an_order_is_that_of_python_tuples(name, signals):
     postponed = signals.violation & (signals.timestep < 10) & ("c" in name)
     expected = [0.0 if late else rank for late, rank in zip(postponed, oracle.rank(rows), strict=True)]
     assert score(name, signals).tolist() == expected
+
+
+@pytest.mark.parametrize("name", [name for name in ORDERS if "c" in name])
+@given(signals=all_signals)
+def test_idle_humans_teleoperate_at_random_behind_all_who_are_needed(name, signals):
+    scores, usual = score(name, signals, idle_humans_teleoperate=True), score(name, signals)
+    free = (usual == 0) & ~signals.violation & (signals.timestep < 10)
+    np.testing.assert_array_equal(scores[~free], usual[~free])
+    assert np.all((scores[free] > 0) & (scores[free] < 1))  # ranks begin at 1
+    assert len(np.unique(scores[free])) == free.sum()
 
 
 @given(st.lists(columns, min_size=3, max_size=3))
@@ -128,7 +141,7 @@ def test_a_registered_priority_is_an_algorithm(monkeypatch):
     fleetjax.register_priority("least_certain", make_least_certain, estimators=("goal",))
     assert "least_certain" in fleetjax.list_algorithms()
     assert priority.get_algorithm("least_certain").estimators == ("goal",)
-    with pytest.raises(ValueError, match="'least_certain' is registered already"):
+    with pytest.raises(ValueError, match="'least_certain' is already registered"):
         fleetjax.register_priority("least_certain", make_least_certain)
     fleetjax.register_priority("other", make_least_certain, estimators=("risk",))
     with pytest.raises(ValueError, match="estimator = 'risk' is unknown; the closest are"):

@@ -111,7 +111,7 @@ def test_render_writes_a_gif(tmp_path, capsys):
     assert capsys.readouterr().out == f"{path}\n"
     with Image.open(io.BytesIO(path.read_bytes())) as image:
         assert (image.size, image.n_frames) == ((128, 48), 3)
-    assert "exists already" in refused(capsys, "render", "humanoid", "--output", path)
+    assert "already exists" in refused(capsys, "render", "humanoid", "--output", path)
 
 
 @needs_gl

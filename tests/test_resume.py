@@ -102,7 +102,7 @@ def test_interventions_are_logged_and_exported(whole, tmp_path, capsys):
         printed = capsys.readouterr()
         assert f"{records.size} timesteps of human actions" in printed.err
         assert printed.out == f"{output}\n"
-        assert "exists already" in refused(capsys, "export", whole, "--format", name, "--output", output)
+        assert "already exists" in refused(capsys, "export", whole, "--format", name, "--output", output)
     with h5py.File(tmp_path / "robomimic") as file:
         assert file["data"].attrs["total"] == records.size
 
@@ -382,7 +382,7 @@ def test_a_folder_in_use_is_refused(stopped, whole, capsys):
 
 def test_a_finished_run_that_lacks_a_file_is_not_called_finished(whole, tmp_path, capsys):
     path = Path(shutil.copytree(whole, tmp_path / "copy"))
-    remedy = "start it again with --overwrite"
+    remedy = f"run it from the start: fleetjax run navigation ... --output {path} --overwrite"
     for name in RESULTS:
         data = (path / name).read_bytes()
         (path / name).unlink()
@@ -487,7 +487,7 @@ def test_a_policy_that_diverges_ends_the_run_and_says_when(stopped, capsys):
     writer.wait()
     assert run_here("run", "--resume", stopped) == 1
     line = capsys.readouterr().err.splitlines()[-1]
-    assert line.startswith("fleetjax: not finite from t = 66 on: policy")
+    assert line.startswith("fleetjax: the policy has NaN or infinite numbers from t = 66 on")
     assert f"The metrics so far are in {stopped}" in line
     assert len(folder.read_metrics(folder.read_run(stopped)).successes) == 68
     assert steps_of(stopped) == [60, 66]

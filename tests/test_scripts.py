@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from commands import TINY, make_metrics
+from commands import TINY, make_metrics, write_run
 
 import fleetjax
-from fleetjax.io import folder, metrics_csv
 
 ROOT = Path(__file__).parents[1]
 SCRIPTS = sorted(
@@ -53,13 +52,19 @@ def make_runs(place: Path) -> None:
     """Write what `human_time.py` reads: two finished runs."""
     config = fleetjax.make_config("navigation", num_robots=6, num_humans=2, num_steps=40)
     for seed in range(2):
-        path = place / f"run-{seed}"
-        path.mkdir()
-        log = metrics_csv.open_log(path)
-        metrics_csv.append(log, make_metrics(seed, 40), 0)
-        log.close()
-        folder.write_config(folder.Run(path, config, seed), sealed=True)
+        write_run(place / f"run-{seed}", config, seed, make_metrics(seed, 40))
 
+
+TINY_STUDY = """
+environment = ["navigation"]
+algorithm = ["expert", "constraint"]
+num_robots = 2
+num_humans = 2
+num_steps = 6
+num_demonstrations = 128
+pretraining_steps = 2
+hidden_sizes = [8]
+"""
 
 CASES = {
     "benchmarks/console.py": Case(("--pages 3 --ticks 10 --robots 4",), (row("3", r"\d+", r"[\d.]+", r"[\d.]+"),)),
@@ -82,22 +87,32 @@ CASES = {
     "benchmarks/startup.py": Case(
         (f"--environments navigation --run-steps 4 -- {FLEET}",), (row("navigation", *[r"\d+\.\d+"] * 4),)
     ),
+    "benchmarks/sweep.py": Case(
+        (f"--seeds 2 -- {FLEET} --algorithm constraint --extra-demonstrations 0 --num-steps 4",),
+        (row("1", r"\d+", r"[\d.]+", r"[\d.]+", "1.00"), row(r"\d+", "1", r"[\d.]+", r"[\d.]+", r"[\d.]+")),
+    ),
     "experiments/block_push.py": Case(
         (f"--algorithms constraint --seeds 0 -- {FLEET} --num-steps 4 --augmented-copies 1 --extra-demonstrations 0",),
-        (row("block_push", "Constraint", r"\d+"), r"^runs/block_push/block_push\.png$"),
+        (r"^## block_push$", row("Constraint", "1", r"[\d.]+", "-"), r"^runs/block_push/block_push\.png$"),
         ("runs/block_push/block_push.png", "runs/block_push/block_push-constraint-0/metrics.csv"),
     ),
     "experiments/clone_error.py": Case(
         ("humanoid --demonstrations 256 --fresh 100 --gradient-steps 2",),
-        (row("256", *[r"\d\.\d{4}"] * 3), r"^variance of the expert's actions: 0\.\d+", r"^error of repeating .*: 0\.\d+"),
+        (row("observation", "256", *[r"\d\.\d{4}"] * 3, r"\d+"), r"variance of the expert's actions \| +\| 0\.\d+"),
         quick=True,
+    ),
+    "experiments/paper.py": Case(
+        ("tiny --studies . --workers 1 --output runs --results rows", "tiny --studies . --results rows --rows-only"),
+        (r"^rows/tiny\.md$", r"^rows/tiny\.png$"),
+        ("rows/tiny.csv", "rows/tiny.md", "rows/tiny.png", "runs/tiny/sweep.json"),
+        lambda place: (place / "tiny.toml").write_text(TINY_STUDY) and None,
     ),
     "experiments/first_look.py": Case(
         (
             f"--environments navigation --algorithms random --seeds 0 1 --output looks -- {FLEET}",
             "--environments navigation --algorithms expert --output alone -- --num-robots 4 --num-steps 4",
         ),
-        (row("navigation", "Random", r"\d+ ± \d+"), row("navigation", "Expert", r"\d+"), r"^looks/first_look\.png$"),
+        (row("Random", "2", r"[\d.]+", r"[\d.]+ to [\d.]+"), row("Expert", "1", r"[\d.]+", "-"), r"^looks/first_look\.png$"),
         ("looks/first_look.png", "alone/first_look.png", "looks/navigation-random-1/policy.msgpack"),
     ),
     "experiments/human_time.py": Case(

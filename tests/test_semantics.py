@@ -240,6 +240,19 @@ def test_semantic_09_locomotion_success_is_judged_on_the_step_that_reaches_the_h
     assert float(after.episode_return) == 96.0
 
 
+def test_semantic_09_the_configuration_says_which_return_is_a_success():
+    """Its default is the environment's; it is traced, so that one program serves several readings."""
+    env = toy_envs.scripted([NEVER] * N, [1] * N, horizon=4)
+    env = env._replace(spec=env.spec._replace(success_return=50.0))
+    config = fleetjax.make_config(env, "expert", num_robots=N, num_humans=N, num_steps=8)
+    assert config.success_return == 50
+    run = jax.vmap(lambda value: fleetjax.run(config.replace(success_return=value), jax.random.key(0), env=env))
+    successes = compiled(run)(jnp.array([50.0, 3.5, 4.0])).metrics.successes  # a step under the supervisor is worth 1
+    assert successes.tolist() == [[0] * 8, [0, 0, 0, N] * 2, [0] * 8]
+    with pytest.raises(ValueError, match="success_return = inf must be"):
+        config.replace(success_return=jnp.inf) and fleetjax.make_config(env, success_return=jnp.inf)
+
+
 def test_semantic_09_soft_resets_are_free_and_leave_humans_where_they_are():
     trace = play([[2, 0, 1, 0]], succeeds_at=[3, NEVER, NEVER, NEVER])
     assert trace.metrics.successes.tolist() == [0, 0, 1, 0, 0, 1, 0, 0, 1, 0, 0, 1]

@@ -31,7 +31,7 @@ def check(config: Config, *, host: str, port: int, token: str | None, interval: 
     """
     controls.controls_of(envs.make(config.environment, config.backend))
     if any(importlib.util.find_spec(name) is None for name in NEEDED):
-        raise ValueError('the console needs a web server: pip install "fleetjax[console]"')
+        raise ValueError('the console needs a web server; run pip install ".[console]" in the source folder')
     from fleetjax.console import guard
 
     guard.check_address(host, token)

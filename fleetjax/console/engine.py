@@ -147,7 +147,7 @@ class Engine:
         return int(self.state.timestep)
 
     def plan(self, seat: np.ndarray) -> View:
-        """Begin a timestep: say who needs whom.
+        """Begin a timestep: say which human helps which robot.
 
         Args:
             seat: u8[M] who sits in each seat.

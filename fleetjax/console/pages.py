@@ -3,7 +3,7 @@
 import base64
 import io
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -100,28 +100,52 @@ def _signals(session: Session, view: View, robot: int) -> list[dict[str, Any]]:
     """Return a robot's signals beside their thresholds."""
     config = session.config
     estimators = get_algorithm(config.algorithm).estimators
+    compared = _compared(config.algorithm)
+    limits = {"uncertainty": config.uncertainty_threshold, "risk": config.risk_threshold}
+    threshold = {name: float(limit) for name, limit in limits.items() if name in compared}
     rows: list[tuple[str, float, float | None]] = [
-        ("uncertainty", float(view.uncertainty[robot]), float(config.uncertainty_threshold))
+        ("uncertainty", float(view.uncertainty[robot]), threshold.get("uncertainty"))
     ]
     if "safety" in estimators:
-        rows.append(("risk", float(view.risk[robot]), float(config.risk_threshold)))
+        rows.append(("risk", float(view.risk[robot]), threshold.get("risk")))
     if "goal" in estimators:
         rows.append(("chance of success", float(view.goal[robot]), None))
     return [{"name": name, "value": value, "threshold": threshold} for name, value, threshold in rows]
+
+
+def _compared(algorithm: str) -> tuple[str, ...]:
+    """Return the signals that an algorithm compares with their thresholds; what users registered may do without."""
+    if algorithm == "ensemble_dagger":
+        return ("uncertainty",)
+    letters = {"u": "uncertainty", "r": "risk"} if text.is_order(algorithm) else {}
+    return tuple(name for letter, name in letters.items() if letter in algorithm)
 
 
 def _why(signals: list[dict[str, Any]], *, violation: bool, bound: bool) -> str:
     """Return why a robot has help, in a few words."""
     if violation:
         return "in violation: it stands still until a hard reset"
-    above = [s["name"] for s in signals if s["threshold"] is not None and s["value"] >= s["threshold"]]
+    compared = [s for s in signals if s["threshold"] is not None]
+    above = [s["name"] for s in compared if s["value"] >= s["threshold"]]
     if above:
         return " and ".join(above) + " above the threshold"
-    return "no signal is above its threshold now; the help still has its shortest time to go" if bound else "its priority"
+    if bound and compared:
+        return "no signal is above its threshold now; the help still has its shortest time to go"
+    return "highest priority"
 
 
-def fleet(session: Session, view: View, kinds: np.ndarray, pictures: Mapping[int, str]) -> dict[str, Any]:
-    """Return what everybody sees of the fleet at a timestep."""
+def fleet(
+    session: Session, view: View, kinds: np.ndarray, confirmed: Sequence[bool], pictures: Mapping[int, str]
+) -> dict[str, Any]:
+    """Return what everybody sees of the fleet at a timestep.
+
+    Args:
+        session: the run.
+        view: the timestep.
+        kinds: u8[M] who sits in each seat.
+        confirmed: whether each seat's person confirmed the hard reset.
+        pictures: of robots, as data.
+    """
     helper = {int(robot): seat for seat, robot in enumerate(view.robot) if robot >= 0}
     robots = [
         {
@@ -136,6 +160,8 @@ def fleet(session: Session, view: View, kinds: np.ndarray, pictures: Mapping[int
         {"who": _WHO[kind], "robot": int(robot), "resets": bool(robot >= 0 and view.resetting[robot])}
         for kind, robot in zip(kinds, view.robot, strict=True)
     ]
+    for seat, kind, sure in zip(seats, kinds, confirmed, strict=True):
+        seat["waits"] = bool(seat["resets"] and kind == PERSON and not sure)  # until its person presses R
     places = np.unique(np.linspace(0, len(session.curves) - 1, POINTS).round().astype(int)).tolist()
     curves = [[round(session.curves[i][panel], 4) for i in places] for panel in range(4)]
     return {

@@ -72,7 +72,7 @@ class Seats:
         """
         mine, kept = self.of(client), self._kept(key)
         if mine not in (None, kept):
-            raise Refused("you have a seat already")
+            raise Refused("you already have a seat")
         if kept is not None:
             old = self.seats[kept]
             before, old.client, old.heard, old.action = old.client, client, now, None

@@ -334,11 +334,12 @@ class Console:
         if self._painting or self._now() < self._next_painting or not any(c.kind == "fleet" for c in self.clients):
             return
         self._next_painting = self._now() + BETWEEN_PAINTINGS
-        self._painting = asyncio.create_task(self._paint(view, kinds, self.session.engine.state.env))
+        confirmed = [seat.confirmed for seat in self.seats.seats]
+        self._painting = asyncio.create_task(self._paint(view, kinds, confirmed, self.session.engine.state.env))
 
-    async def _paint(self, view: View, kinds: np.ndarray, env: EnvState) -> None:
+    async def _paint(self, view: View, kinds: np.ndarray, confirmed: list[bool], env: EnvState) -> None:
         def draw() -> str:
-            return pages.to_json(pages.fleet(self.session, view, kinds, pages.tiles(self.session, env, view)))
+            return pages.to_json(pages.fleet(self.session, view, kinds, confirmed, pages.tiles(self.session, env, view)))
 
         state = await asyncio.to_thread(draw)
         for client in self.clients:

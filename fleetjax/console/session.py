@@ -70,7 +70,7 @@ class Session:
         self.curves.append(self._heights())
         found = first_divergence(metrics)
         if found:
-            raise Diverged(f"not finite from t = {view.timestep} on: {', '.join(found[1])}; try a smaller learning_rate")
+            raise Diverged(text.divergence(view.timestep, found[1]))
         return metrics
 
     def _heights(self) -> tuple[float, float, float, float]:

@@ -60,7 +60,9 @@ def from_playground(
     try:
         registry = importlib.import_module("mujoco_playground").registry
     except ImportError as error:
-        raise ImportError(f'from_playground needs MuJoCo Playground: pip install "fleetjax[playground]" ({error})') from error
+        raise ImportError(
+            f'from_playground needs MuJoCo Playground; run pip install ".[playground]" in the source folder ({error})'
+        ) from error
 
     if name not in registry.ALL_ENVS:
         raise ValueError(f"playground environment = {name!r} is unknown; choose one of {', '.join(registry.ALL_ENVS)}")
@@ -102,7 +104,9 @@ def _adapt(raw: Any, name: str, *, supervisor: str, horizon: int, success_return
         )
 
     size = jax.eval_shape(_observation, first.obs).shape[-1]
-    spec = base.EnvSpec(name, size, raw.action_size, horizon, float(raw.dt), supervisor=supervisor)
+    spec = base.EnvSpec(
+        name, size, raw.action_size, horizon, float(raw.dt), supervisor=supervisor, success_return=success_return
+    )
     return base.Env(reset, step, spec)
 
 

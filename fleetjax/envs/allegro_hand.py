@@ -1,7 +1,9 @@
 """Allegro hand: 16 position servos turn a cube to random orientations, one goal after the other (paper, Section 5.1).
 
-Differences from the Isaac Gym task, where a reading of it was unclear or mistaken: joint torques are the servos', not
-readings that are always zero; no joint starts outside its limits; an episode starts with the cube at rest in the hand.
+An action changes the angles that the servos hold. The Isaac Gym task has this as an option (`useRelativeControl`), off by
+default; policies that set the angles themselves cannot be cloned from a few episodes. Other differences from that task, where a
+reading of it was unclear or mistaken: joint torques are the servos', not readings that are always zero; no joint starts outside
+its limits; an episode starts with the cube at rest in the hand.
 """
 
 import functools
@@ -19,6 +21,7 @@ from fleetjax.types import EnvState
 
 HORIZON = 600
 SUBSTEPS = 4
+LARGEST_CHANGE = 0.3  # of a target in a control step, in halves of its joint's range
 GOAL_POSITION = np.array([0.0, -0.2, 0.52], np.float32)  # m
 SHOWN_AT = np.array([-0.16, -0.2, 0.6], np.float32)  # m, where pictures show the goal
 TOLERANCE = 0.1  # rad, within which a goal is reached
@@ -34,10 +37,12 @@ class Hand(NamedTuple):
     Attributes:
         body: the simulated hand (joints 0 to 15) and cube (a free joint).
         goal: f32[4] unit quaternion.
+        target: f32[16] what the servos hold, the joints' limits at -1 and 1.
     """
 
     body: PhysicsState
     goal: jax.Array
+    target: jax.Array
 
 
 def make_env(*, backend: str = "auto", tolerance: float = TOLERANCE) -> base.Env:
@@ -59,14 +64,16 @@ def make_env(*, backend: str = "auto", tolerance: float = TOLERANCE) -> base.Env
         del robot  # every robot starts from the same distribution
         key_start, key_goal = jax.random.split(key)
         start = settled[jax.random.randint(key_start, (), 0, settled.shape[0])]
-        hand = Hand(physics.initial._replace(qpos=start), draw_orientation(key_goal))
-        action = jnp.clip(2 * (start[:16] - low) / (high - low) - 1, -1.0, 1.0)  # that holds the fingers where they are
-        return base.begin(hand, observe(hand, action, low, high))
+        target = jnp.clip(2 * (start[:16] - low) / (high - low) - 1, -1.0, 1.0)  # holds the fingers where they are
+        hand = Hand(physics.initial._replace(qpos=start), draw_orientation(key_goal), target)
+        return base.begin(hand, observe(hand, low, high))
 
     def step(state: EnvState, action: jax.Array, active: jax.Array, key: jax.Array) -> EnvState:
         del key  # deterministic
         action = jnp.clip(action, -1.0, 1.0)
-        hand = state.physics._replace(body=physics.step(state.physics.body, targets(action, low, high), active))
+        target = jnp.clip(state.physics.target + LARGEST_CHANGE * action, -1.0, 1.0)
+        body = physics.step(state.physics.body, angles(target, low, high), active)
+        hand = state.physics._replace(body=body, target=jnp.nan_to_num(target))  # a NaN action makes the body diverge
         distance = jnp.linalg.norm(hand.body.qpos[16:19] - GOAL_POSITION)
         violation = (distance >= DROP_DISTANCE) | hand.body.diverged
         angle = angle_between(hand.body.qpos[19:23], hand.goal)
@@ -75,7 +82,7 @@ def make_env(*, backend: str = "auto", tolerance: float = TOLERANCE) -> base.Env
         return base.proceed(
             state,
             physics=hand,
-            obs=observe(hand, jnp.nan_to_num(action), low, high),  # an action that is no number makes the body diverge
+            obs=observe(hand, low, high),
             reward=jnp.where(hand.body.diverged, 0.0, reward),
             violation=violation,
             success=success,
@@ -84,7 +91,7 @@ def make_env(*, backend: str = "auto", tolerance: float = TOLERANCE) -> base.Env
 
     def next_goal(state: EnvState, key: jax.Array) -> EnvState:
         hand = state.physics._replace(goal=draw_orientation(key))
-        return state._replace(physics=hand, obs=observe(hand, state.obs[72:], low, high))
+        return state._replace(physics=hand, obs=observe(hand, low, high))
 
     def pose(state: EnvState) -> tuple[jax.Array, jax.Array]:
         return state.physics.body.qpos, jnp.concatenate([SHOWN_AT, state.physics.goal])[None]
@@ -92,9 +99,9 @@ def make_env(*, backend: str = "auto", tolerance: float = TOLERANCE) -> base.Env
     return base.Env(reset, step, spec, next_goal, base.Scene(physics.model, pose))
 
 
-def targets(action: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
-    """Return the angles f32[16] (rad) that the servos hold for an action f32[16] in [-1, 1], given the joints' limits."""
-    return low + (action + 1) / 2 * (high - low)
+def angles(target: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
+    """Return the angles f32[16] (rad) that a target f32[16] in [-1, 1] stands for, given the joints' limits."""
+    return low + (target + 1) / 2 * (high - low)
 
 
 def draw_orientation(key: jax.Array) -> jax.Array:
@@ -106,21 +113,21 @@ def draw_orientation(key: jax.Array) -> jax.Array:
     return multiply(about_x, about_y)
 
 
-def observe(hand: Hand, action: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
-    """Return the observation f32[88] of a hand to which `action` f32[16] was last applied, clipped to [-5, 5].
+def observe(hand: Hand, low: jax.Array, high: jax.Array) -> jax.Array:
+    """Return the observation f32[88] of a hand, given its joints' limits (rad), clipped to [-5, 5].
 
     Entries: 0-15 joint angles, limits at -1 and 1; 16-31 joint velocities (rad/s, x 0.2); 32-47 the servos' torques (N m,
     x 10); cube: 48-50 position (m), 51-54 orientation (x, y, z, w), 55-57 velocity (m/s), 58-60 angular velocity (rad/s,
     x 0.2), both in the world's frame; goal: 61-63 position (m), 64-67 orientation; 68-71 the turn from goal to cube; 72-87
-    the action.
+    the servos' targets.
     """
     body = hand.body
-    angles, velocities, orientation = body.qpos[:16], body.qvel[:16], body.qpos[19:23]
+    joints, velocities, orientation = body.qpos[:16], body.qvel[:16], body.qpos[19:23]
     torques = jnp.clip(
-        STIFFNESS * (targets(action, low, high) - angles) - DAMPING * velocities, -LARGEST_TORQUE, LARGEST_TORQUE
+        STIFFNESS * (angles(hand.target, low, high) - joints) - DAMPING * velocities, -LARGEST_TORQUE, LARGEST_TORQUE
     )
     entries = [
-        (2 * angles - high - low) / (high - low),
+        (2 * joints - high - low) / (high - low),
         0.2 * velocities,
         10.0 * jnp.clip(torques, -LARGEST_TORQUE, LARGEST_TORQUE),
         body.qpos[16:19],
@@ -130,7 +137,7 @@ def observe(hand: Hand, action: jax.Array, low: jax.Array, high: jax.Array) -> j
         jnp.asarray(GOAL_POSITION),
         _scalar_last(hand.goal),
         _scalar_last(multiply(orientation, conjugate(hand.goal))),
-        action,
+        hand.target,
     ]
     return jnp.clip(jnp.concatenate(entries), -5.0, 5.0)
 
@@ -146,7 +153,7 @@ def view(obs: jax.Array) -> jax.Array:
     Entries: 0-31 joint angles and velocities; 32-34 the cube's distance from the goal's position; 35-49 fourth moments of its
     edges' directions; 50-55 the edge nearest to the world's x and the one nearest to its z, each as a unit vector; 56-61
     velocity and angular velocity; 62-64 the turn that is left as a rotation vector (rad), 65 its angle; 66-68 the same vector
-    on a scale on which the last tenth of a radian is half of all; 69-84 the action.
+    on a scale on which the last tenth of a radian is half of all; 69-84 the servos' targets.
     """
     orientation, missing = jnp.roll(obs[51:55], 1), conjugate(jnp.roll(obs[68:72], 1))
     edges = rotation_matrix(orientation)  # in columns

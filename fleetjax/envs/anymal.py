@@ -51,7 +51,15 @@ def make_env(*, backend: str = "auto", success_return: float | None = None) -> b
     if success_return is None:
         success_return = expert_records.success_return("anymal", SUCCESS_FLOOR)
     physics = make_physics("anymal.xml", substeps=SUBSTEPS, backend=backend)
-    spec = base.EnvSpec("anymal", 48, physics.model.nu, HORIZON, physics.control_step, supervisor="anymal")
+    spec = base.EnvSpec(
+        "anymal",
+        48,
+        physics.model.nu,
+        HORIZON,
+        physics.control_step,
+        supervisor="anymal",
+        success_return=success_return,
+    )
 
     def reset(key: jax.Array, robot: jax.Array) -> EnvState:
         del robot  # every robot starts from the same distribution
@@ -126,7 +134,7 @@ def observe(walker: Walker, action: jax.Array) -> jax.Array:
 
 
 def _reward(walker: Walker, target: jax.Array) -> jax.Array:
-    """Return the reward a second."""
+    """Return the reward per second."""
     body = walker.body
     linear, angular = base_velocity(body)
     missed = jnp.sum((linear[:2] - walker.command[:2]) ** 2)

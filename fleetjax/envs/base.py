@@ -24,6 +24,8 @@ class EnvSpec(NamedTuple):
         supervisor: registered name of the supervisor that helps by default.
         image_shape: height, width and channels if the observation is an image: its pixel values, whole numbers from 0 to
             255, row by row; None if it is not.
+        success_return: the default of the configuration's field of that name: the return above which an episode of full length
+            succeeds; None if the environment says itself what a success is.
     """
 
     name: str
@@ -35,6 +37,7 @@ class EnvSpec(NamedTuple):
     has_goal: bool = False
     supervisor: str = ""
     image_shape: tuple[int, int, int] | None = None
+    success_return: float | None = None
 
 
 class Scene(NamedTuple):
@@ -50,7 +53,7 @@ class Scene(NamedTuple):
 
 
 class Env(NamedTuple):
-    """Pure functions of one robot's task. It never resets itself: that is what fleets compete for.
+    """Pure functions of one robot's task. It never resets itself. Robots compete for the humans who reset them.
 
     Attributes:
         reset: `(key, robot i32[]) -> EnvState`, a draw from the initial distribution of that robot.

@@ -33,7 +33,15 @@ def make_env(*, backend: str = "auto", success_return: float | None = None) -> b
     if success_return is None:
         success_return = expert_records.success_return("humanoid", SUCCESS_FLOOR)
     physics = make_physics("humanoid.xml", substeps=SUBSTEPS, backend=backend)
-    spec = base.EnvSpec("humanoid", 108, physics.model.nu, HORIZON, physics.control_step, supervisor="humanoid")
+    spec = base.EnvSpec(
+        "humanoid",
+        108,
+        physics.model.nu,
+        HORIZON,
+        physics.control_step,
+        supervisor="humanoid",
+        success_return=success_return,
+    )
     joints = _Joints(physics.model)
 
     def reset(key: jax.Array, robot: jax.Array) -> EnvState:

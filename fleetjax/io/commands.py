@@ -3,7 +3,7 @@
 import argparse
 import contextlib
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +12,25 @@ import numpy as np
 
 from fleetjax import envs
 from fleetjax.checks import check_run
-from fleetjax.config import make_config
+from fleetjax.config import Config, make_config
 from fleetjax.console.controls import CONTROLS
 from fleetjax.envs import get_defaults, list_envs
-from fleetjax.field import every_field
-from fleetjax.io import chunks, export, files, flags, folder, formats, plain, resumable, text
+from fleetjax.field import FIELDS, every_field, owners_in_words
+from fleetjax.io import (
+    calibration,
+    chunks,
+    export,
+    files,
+    flags,
+    folder,
+    formats,
+    outcomes,
+    resumable,
+    sources,
+    study,
+    sweep,
+    text,
+)
 from fleetjax.io.errors import Refusal
 from fleetjax.io.progress import progress, say
 from fleetjax.metrics import Metrics
@@ -38,8 +52,7 @@ def run_fleet(arguments: argparse.Namespace) -> None:
     """Run a new fleet, or resume a run."""
     given = _parameters(arguments)
     with _refusing():
-        if arguments.checkpoint_every < 0 or arguments.checkpoint_every == 1:
-            raise ValueError(f"checkpoint_every = {arguments.checkpoint_every} must be 0 (none) or at least 2 timesteps")
+        resumable.check_interval(arguments.checkpoint_every)
         run = _run_to_resume(arguments, given) if arguments.resume else _new_run(arguments, given)
     if not arguments.resume:
         folder.check_folder(run.folder, overwrite=arguments.overwrite)
@@ -67,15 +80,25 @@ def _new_run(arguments: argparse.Namespace, given: Mapping[str, Any]) -> folder.
     Raises:
         ValueError: if the configuration cannot be used.
     """
+    config, seed = _config(arguments, given), arguments.seed or 0
+    logged = arguments.command == "run" and arguments.log_interventions
+    return folder.Run(arguments.output or folder.default_folder(config, seed), config, seed, logged)
+
+
+def _config(arguments: argparse.Namespace, given: Mapping[str, Any]) -> Config:
+    """Return the configuration that was asked for.
+
+    Raises:
+        ValueError: if it cannot be used.
+    """
     if "environment" not in given:
         known = CONTROLS if arguments.command == "console" else list_envs()
         resume = ", or resume a run with --resume RUN" if arguments.command == "run" else ""
         raise ValueError(f"ENV is missing; choose one of {', '.join(known)}{resume}")
     overrides = {name: value for name, value in given.items() if name not in ("environment", "algorithm")}
-    config, seed = make_config(given["environment"], given.get("algorithm", "cur"), **overrides), arguments.seed or 0
+    config = make_config(given["environment"], given.get("algorithm", "cur"), **overrides)
     check_run(config)
-    logged = arguments.command == "run" and arguments.log_interventions
-    return folder.Run(arguments.output or folder.default_folder(config, seed), config, seed, logged)
+    return config
 
 
 def _run_to_resume(arguments: argparse.Namespace, given: Mapping[str, Any]) -> folder.Run:
@@ -91,17 +114,49 @@ def _run_to_resume(arguments: argparse.Namespace, given: Mapping[str, Any]) -> f
         raise ValueError(f"{run.folder} was supervised by people, so it cannot be resumed; repeat it with fleetjax replay")
     if arguments.log_interventions and not run.logged:
         raise ValueError("the run does not log interventions; omit --log-interventions, or start a new run")
-    has = plain.to_plain(run.config) | {"seed": run.seed}
-    asked = plain.to_plain(run.config.replace(**given)) | {"seed": run.seed if arguments.seed is None else arguments.seed}
-    for name, value in asked.items():
-        if value != has[name]:
-            raise ValueError(f"{name} = {value}, but the run has {has[name]}; omit it, or start a new run")
+    seed = run.seed if arguments.seed is None else arguments.seed
+    difference = folder.first_difference(run._replace(config=run.config.replace(**given), seed=seed), run)
+    if difference:
+        raise ValueError(f"{difference}; omit it, or start a new run")
     return run
 
 
 def _report(run: folder.Run, metrics: Metrics, last: str) -> None:
     print(f"\n{text.headline(run.config, run.seed)}\n\n{text.run_table(metrics, run.config)}\n")
     print(f"{last}. Run folder: {run.folder}")
+
+
+def run_sweep(arguments: argparse.Namespace) -> None:
+    """Run every combination of several values."""
+    with _refusing():
+        subjects = [name for names in arguments.subjects for name in names]
+        asked = study.make_study(subjects, vars(arguments))
+        resumable.check_interval(asked.checkpoint_every)
+        runs = study.plan(asked)
+        sweep.check_folder(asked, runs)
+    sweep.run_all(asked, runs)
+
+
+def calibrate_field(arguments: argparse.Namespace) -> None:
+    """Find the value of a parameter at which an algorithm spends a given human time."""
+    given = _parameters(arguments)
+    with _refusing():
+        if arguments.human_time is None:
+            raise ValueError("--human-time is missing; say how many human timesteps a run should spend")
+        config = _config(arguments, given)
+        request = calibration.Request(
+            config,
+            arguments.field or calibration.default_field(config),
+            arguments.human_time,
+            tuple(range(arguments.first_seed, arguments.first_seed + arguments.seeds)),
+            arguments.tolerance,
+            arguments.most,
+            arguments.output or Path("runs") / f"calibrate-{config.environment}-{config.algorithm}",
+            arguments.checkpoint_every,
+        )
+        calibration.check(request)
+    found = calibration.calibrate(request)
+    print(calibration.report(request, found))
 
 
 def list_all(arguments: argparse.Namespace) -> None:
@@ -120,9 +175,9 @@ def list_all(arguments: argparse.Namespace) -> None:
     print("\nalgorithms")
     named = [name for name in list_algorithms() if not text.is_order(name) or name == "cur"]
     print(text.table([("", name, text.label(name), text.meaning(name)) for name in named]))
-    for name in list_algorithms():
-        for own, field in get_algorithm(name).parameters.items():
-            print(f"  {name}'s own parameter: {own} {flags.show(field.default)}, {field.help}")
+    for name, field in every_field().items():
+        if name not in FIELDS:
+            print(f"  own parameter of {owners_in_words(name)}: {name} {flags.show(field.default)}, {field.help}")
     print(f"  and {text.ORDERS}")
 
 
@@ -131,20 +186,51 @@ def plot_runs(arguments: argparse.Namespace) -> None:
     from fleetjax.io import figure  # matplotlib takes a while to import
 
     with _refusing():
-        figure.check_format(arguments.output)
-        runs = [folder.read_run(path) for path in arguments.runs]
-        data = [(run.config, run.seed, folder.read_metrics(run)) for run in runs]
+        files.check_ending(arguments.output, figure.FORMATS)
+        found = sources.collect(arguments.runs)
     output = files.check_free(arguments.output, overwrite=arguments.overwrite)
-    groups = figure.group(data)
-    for run, (_, _, metrics) in zip(runs, data, strict=True):
-        if len(metrics.successes) < run.config.num_steps:
-            say(f"{run.folder} was interrupted; curves with the same settings end at {len(metrics.successes)} timesteps")
-    skipped = len(data) - sum(len(curves.values) for curves in groups)
+    for run in found:
+        if run.timesteps[-1] < run.config.num_steps:
+            say(f"{run.name} was interrupted; curves with the same settings end at {run.timesteps[-1]} timesteps")
+    _say_skipped(found)
+    files.write(output, figure.render(figure.plot(found), arguments.output.suffix))
+    print(arguments.output)
+
+
+def _say_skipped(found: Sequence[outcomes.Outcome]) -> None:
+    skipped = len(found) - sum(len(group.runs) for group in outcomes.group(found))
     if skipped:
         say(f"skipped {text.plural(skipped, 'run')} with the same settings and seed as a later one")
-    drawn = figure.draw(groups)
-    files.write(output, figure.render(drawn, arguments.output.suffix))
-    print(arguments.output)
+
+
+def compare_runs(arguments: argparse.Namespace) -> None:
+    """Compare runs over their seeds: print or write tables, draw figures, store rows."""
+    from fleetjax.io import comparing, figure, rows
+
+    with _refusing():
+        for path in arguments.output:
+            files.check_ending(path, (".md", ".csv", *figure.FORMATS))
+        if arguments.rows:
+            files.check_ending(arguments.rows, (rows.SUFFIX,), flag="--rows")
+        found = sources.collect(arguments.runs)
+    outputs = [*arguments.output, *([arguments.rows] if arguments.rows else [])]
+    targets = [files.check_free(path, overwrite=arguments.overwrite) for path in outputs]
+    with _refusing():
+        metrics, different = arguments.metric or comparing.METRICS, arguments.allow_different
+        compared = comparing.compare(found, arguments.against, metrics, allow_different=different)
+    _say_skipped(found)
+    if not arguments.output:
+        print(compared.markdown(), end="")
+    for path, target in zip(arguments.output, targets, strict=False):
+        if path.suffix in figure.FORMATS:
+            content = figure.render(figure.plot(found), path.suffix)
+        else:
+            content = (compared.csv() if path.suffix == ".csv" else compared.markdown()).encode()
+        files.write(target, content)
+        print(path)
+    if arguments.rows:
+        files.write(targets[-1], rows.write(found))
+        say(f"{arguments.rows}: {text.plural(len(found), 'row')}")
 
 
 def evaluate_policy(arguments: argparse.Namespace) -> None:
@@ -260,8 +346,11 @@ def replay(arguments: argparse.Namespace) -> None:
 
 COMMANDS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "run": run_fleet,
+    "sweep": run_sweep,
+    "calibrate": calibrate_field,
     "list": list_all,
     "plot": plot_runs,
+    "compare": compare_runs,
     "evaluate": evaluate_policy,
     "export": export_interventions,
     "render": render_robots,

@@ -9,5 +9,9 @@ class Diverged(ArithmeticError):
     """Something learnt is no longer finite."""
 
 
+class Incomplete(Exception):
+    """A sweep of which some runs failed."""
+
+
 class Disagreement(ArithmeticError):
     """A replay gave something else than the run."""

@@ -4,7 +4,7 @@ The paper calls violations hard resets.
 """
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,13 +16,15 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
+from fleetjax import statistics
 from fleetjax.config import Config
-from fleetjax.io import text
-from fleetjax.io.plain import to_plain
+from fleetjax.io import outcomes, text
+from fleetjax.io.sources import Source, collect
 from fleetjax.metrics import Metrics, rohe
 
 PANELS = ("Cumulative successes", "Cumulative violations", "Cumulative idle timesteps", "Return on human effort")
 _LEGEND_WIDTH = 165  # letters that fit into a row
+_RESAMPLES = 1000  # of each band; more would not be seen
 FORMATS = (".png", ".pdf", ".svg")
 # Okabe and Ito's palette: told apart with every common kind of colour vision. One colour for an algorithm, always.
 _COLOURS = {
@@ -62,13 +64,15 @@ class Curves(NamedTuple):
         label: its name in the legend.
         algorithm: gives the colour.
         environment: where it was run.
-        values: f64[S, 4, T] the panels' curves, for each seed.
+        values: f64[S, 4, K] the panels' curves, for each seed.
+        timesteps: i64[K] at which they are known.
     """
 
     label: str
     algorithm: str
     environment: str
     values: np.ndarray
+    timesteps: np.ndarray
 
 
 def curves_of(metrics: Metrics, config: Config) -> np.ndarray:
@@ -77,44 +81,41 @@ def curves_of(metrics: Metrics, config: Config) -> np.ndarray:
     return np.vstack([np.cumsum(counts, axis=1), np.asarray(rohe(metrics, config))])
 
 
-def group(runs: Sequence[tuple[Config, int, Metrics]]) -> list[Curves]:
-    """Gather runs that differ in nothing but their seed. Labels tell what else differs.
+def plot(runs: str | Path | Iterable[Source], title: str = "") -> Figure:
+    """Draw runs as the paper does: cumulative successes, violations and idle time, and the return on human effort.
+
+    Runs that differ in nothing but their seed become one line: their mean, in a band of 95 % intervals (BCa bootstrap at each
+    timestep), or from the smallest to the largest where there are fewer than five seeds.
 
     Args:
-        runs: configuration, seed and Metrics[T] of each; a seed that comes twice counts once, the later run.
+        runs: as `compare` takes them.
+        title: takes the place of the legend.
 
-    Returns:
-        Curves for each setting, in order of appearance, cut at the shortest of its runs.
+    Raises:
+        ValueError: if there are no runs, or one is damaged.
     """
-    groups: dict[str, dict[int, Metrics]] = {}
-    configs: dict[str, Config] = {}
-    for config, seed, metrics in runs:
-        key = repr(to_plain(config))
-        configs[key] = config
-        groups.setdefault(key, {})[seed] = metrics
-    labels = _labels([to_plain(config) for config in configs.values()])
-    result = []
-    for (key, seeds), name in zip(groups.items(), labels, strict=True):
-        length = min(len(metrics.successes) for metrics in seeds.values())
-        values = np.stack([curves_of(metrics, configs[key])[:, :length] for metrics in seeds.values()])
-        result.append(Curves(name, configs[key].algorithm, configs[key].environment, values))
-    return result
+    return draw(group(runs), title)
 
 
-def _labels(settings: Sequence[dict[str, Any]]) -> list[str]:
-    """Return a name for each setting: the algorithm, and the fields in which settings differ that share it and the place."""
-    names = []
-    for fields in settings:
-        alike = [other for other in settings if all(other[name] == fields[name] for name in ("algorithm", "environment"))]
-        differing = [name for name in fields if any(other[name] != fields[name] for other in alike)]
-        if len(differing) > 1 and "human_capacity" in differing:
-            differing.remove("human_capacity")  # it follows from the others
-        names.append(", ".join([text.label(fields["algorithm"]), *(f"{name} {fields[name]}" for name in differing)]))
-    return names
+def group(runs: str | Path | Iterable[Source]) -> list[Curves]:
+    """Return the curves of runs, those that differ in nothing but their seed together, cut at the shortest of them."""
+    return [
+        Curves(group.label, group.config.algorithm, group.config.environment, *_align(list(group.runs.values())))
+        for group in outcomes.group(collect(runs))
+    ]
+
+
+def _align(runs: Sequence[outcomes.Outcome]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the curves f64[S, 4, K] of several runs, and the timesteps i64[K] at which all of them are known."""
+    timesteps = min((run.timesteps for run in runs), key=len)
+    within = np.count_nonzero(timesteps <= min(run.timesteps[-1] for run in runs))
+    timesteps = timesteps[: max(1, within)]
+    curves = [(run.timesteps, curves_of(run.metrics, run.config)) for run in runs]
+    return np.array([[np.interp(timesteps, t, curve) for curve in values] for t, values in curves]), timesteps
 
 
 def draw(groups: Sequence[Curves], title: str = "") -> Figure:
-    """Draw each group in every panel: the mean over its seeds, and a band of one standard deviation.
+    """Draw each group in every panel: the mean over its seeds, and a band of `statistics.mean_bounds`.
 
     Args:
         groups: what to draw; each environment has its own row of panels.
@@ -134,13 +135,14 @@ def draw(groups: Sequence[Curves], title: str = "") -> Figure:
                 for curves, (colour, dashes) in here:
                     seeds = curves.values[:, panel]
                     label = f"{curves.label} ({text.plural(len(seeds), 'seed')})" if len(numbers) > 1 else curves.label
-                    t, mean = np.arange(1, seeds.shape[1] + 1), seeds.mean(axis=0)
-                    (line,) = ax.plot(t, mean, color=colour, linestyle=dashes, linewidth=1.8, label=label)
+                    t = curves.timesteps
+                    (line,) = ax.plot(t, seeds.mean(axis=0), color=colour, linestyle=dashes, linewidth=1.8, label=label)
                     legend.setdefault(label, line)
                     if len(seeds) > 1:
-                        deviation = seeds.std(axis=0, ddof=1)
-                        ax.fill_between(t, mean - deviation, mean + deviation, color=colour, alpha=0.2, linewidth=0)
-                ax.set_xlim(0, max(curves.values.shape[2] for curves, _ in here))
+                        kept = outcomes.thinned(len(t))
+                        low, high = statistics.mean_bounds(seeds[:, kept], _RESAMPLES)
+                        ax.fill_between(t[kept], low, high, color=colour, alpha=0.2, linewidth=0)
+                ax.set_xlim(0, max(curves.timesteps[-1] for curves, _ in here))
                 ax.set_ylim(bottom=0)
             _spread_returns(row[-1], [curves.values[:, -1, -1].mean() for curves, _ in here])
             if len(places) > 1:
@@ -161,8 +163,12 @@ def _note(groups: Sequence[Curves]) -> str:
     """Return where the fleets ran, and what lines and bands are where there are several seeds."""
     places = ", ".join(dict.fromkeys(curves.environment for curves in groups))
     seeds = {len(curves.values) for curves in groups}
+    if max(seeds) == 1:
+        return places
     number = f" of {max(seeds)} seeds" if len(seeds) == 1 else ""
-    return f"{places}: mean{number}, band of one standard deviation" if max(seeds) > 1 else places
+    band = "95 % interval" if max(seeds) >= statistics.MIN_SEEDS else "range"
+    mixed = band != "range" and any(1 < count < statistics.MIN_SEEDS for count in seeds)
+    return f"{places}: mean{number}, band: {band}{f', range below {statistics.MIN_SEEDS} seeds' if mixed else ''}"
 
 
 def _prepare_axes(ax: Axes, name: str) -> None:
@@ -201,13 +207,3 @@ def render(figure: Figure, suffix: str = ".png") -> bytes:
     with mpl.rc_context(_STYLE):
         figure.savefig(data, format=suffix.removeprefix("."), dpi=160)
     return data.getvalue()
-
-
-def check_format(path: Path) -> None:
-    """Check that a figure can be written to a file of this name.
-
-    Raises:
-        ValueError: if its ending is none that is known.
-    """
-    if path.suffix not in FORMATS:
-        raise ValueError(f"--output {path} must end in one of {', '.join(FORMATS)}")

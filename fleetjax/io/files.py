@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,16 @@ def check_place(path: Path) -> None:
         raise OSError(f"{path} cannot be written: {error.strerror}") from None
 
 
+def check_ending(path: Path, endings: Sequence[str], flag: str = "--output") -> None:
+    """Check that a file has one of the endings that are known.
+
+    Raises:
+        ValueError: if it has not.
+    """
+    if path.suffix not in endings:
+        raise ValueError(f"{flag} {path} must end in {'one of ' * (len(endings) > 1)}{', '.join(endings)}")
+
+
 def check_free(path: Path, *, overwrite: bool, is_folder: bool = False) -> Path:
     """Check that an output can be written without loss, before it is computed.
 
@@ -58,7 +68,7 @@ def check_free(path: Path, *, overwrite: bool, is_folder: bool = False) -> Path:
         OSError: if it cannot be written there.
     """
     if os.path.lexists(path) and not overwrite and not (is_folder and path.is_dir() and not any(path.iterdir())):
-        raise FileExistsError(f"{path} exists already; pass --overwrite to replace it")
+        raise FileExistsError(f"{path} already exists; pass --overwrite to replace it")
     if path.exists() and path.is_dir() != is_folder:
         raise FileExistsError(f"{path} is a {'file' if path.is_file() else 'folder'}; choose another --output")
     target = Path(os.path.realpath(path))

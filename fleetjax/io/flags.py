@@ -10,30 +10,46 @@ from types import MappingProxyType
 from typing import Any, NoReturn
 
 from fleetjax.environments import get_defaults, list_envs
-from fleetjax.field import FIELDS, Field, every_field, owners
+from fleetjax.field import FIELDS, Field, every_field, owners_in_words
 from fleetjax.io.errors import Refusal
 from fleetjax.io.formats import FORMATS
+from fleetjax.io.lists import listed, sizes
 from fleetjax.registry import unknown
 from fleetjax.version import VERSION
 
 _LARGEST_SEED = 2**32 - 1  # JAX folds larger ones onto these
 _LARGEST = 2**31 - 1
+_RUNS = "run folder, folder that holds run folders, or file that `fleetjax compare --rows` wrote"
 PORT = 8765  # that a console serves
 _ABOUT = """\
 Interactive fleet learning: N robots, M humans. Who should get help, and what does the fleet gain?
 
-  fleetjax run navigation               a small fleet, finished in a minute
+  fleetjax run navigation               100 point robots, a minute or two
   fleetjax run humanoid                 the paper's main experiment, C.U.R. with 100 humanoids
   fleetjax run humanoid --help          every parameter, with its meaning, unit and default
+  fleetjax sweep navigation --seeds 5 --output DIR   many runs, in parallel
+  fleetjax calibrate navigation --human-time 10000   the threshold at which C.U.R. spends so much
   fleetjax plot runs/humanoid-*         runs in one figure; seeds become a mean and a band
+  fleetjax compare runs --against cur   tables of runs: means, intervals, differences
   fleetjax evaluate RUN                 the trained policy on its own; nobody teleoperates
   fleetjax console navigation --humans 2   real people supervise, in their browsers"""
 _RUN_ABOUT = """\
 Clone demonstrations, then run the fleet while it learns from those who help it. Prints a table at the end and writes a run
 folder: config.json, metrics.csv (one row per timestep), figure.png, policy.msgpack and the last two checkpoints."""
+_SWEEP_ABOUT = """\
+Run every combination of several values in parallel, each in a run folder of its own below DIR. The same command resumes a sweep
+that was stopped, and a larger one extends it.
+
+Every parameter takes a list: --algorithm cur,random --num-humans 5,10 --hidden-sizes 64 64,256 256. A parameter of one
+algorithm is given to that algorithm alone. A FILE holds the same names with lists, in TOML; flags override it."""
+_CALIBRATE_ABOUT = """\
+Find the value of a parameter at which an algorithm spends a given human time, by a few runs with the first seed, and confirm it
+with the others. Thresholds do not carry over between robots, policies or sizes of a run. The runs are kept below DIR, so the
+same command resumes, and a finished one answers at once."""
 _RUN_NOTE = """\
 Some algorithms change defaults: expert has as many humans as robots; constraint gets as many extra demonstrations as C.U.R.
-uses human timesteps; constraint_trained also takes as many gradient steps before the start as the others take in total."""
+uses human timesteps (none where the environment does not ship); constraint_trained also takes as many gradient steps before
+the start as the others take in total."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -61,12 +77,17 @@ class _Parser(argparse.ArgumentParser):
         return f"unknown flag {flag}; the closest is {close[0]}"
 
 
+_COMPARE_ABOUT = """Compare runs over their seeds. Runs that differ in nothing but their seed are one group. Prints a table for
+each environment and metric: means with 95 % intervals, interquartile means and human time, and with --against how each
+group differs from one. docs/comparing.md explains the numbers."""
 _EXPORT_ABOUT = """Write what teleoperating humans saw and did as a data set for other tools, one episode per intervention. The
 run must have been made with --log-interventions."""
 _RENDER_ABOUT = """Draw robots as an animation, a grid of tiles. Teleoperated robots are tinted blue, robots in violation red.
 
 expert: the supervisor acts on every robot. robot: the trained policy of a run acts, and nobody teleoperates. mixed: the
 pre-trained fleet runs, and its humans help."""
+_EVALUATE_ABOUT = """Run the trained policy of a run without teleoperation: humans only reset robots in violation, and nothing
+is learnt. Prints a table and writes RUN/evaluation.json."""
 _CONSOLE_ABOUT = """Run a fleet one timestep at a time, with people as supervisors: each opens a page, gets a seat, and helps
 the robot that the algorithm allocates. Ends with a table and a run folder as `fleetjax run` does, and a record of what people
 did, so that `fleetjax replay` can repeat the run."""
@@ -92,20 +113,23 @@ def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser
     parser.add_argument("--version", action="version", version=f"fleetjax {VERSION}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands")
     _add_run(commands, environment)
+    _add_sweep(commands, environment)
+    _add_calibrate(commands, environment)
     commands.add_parser("list", help="show environments and algorithms")
 
     plot = commands.add_parser("plot", help="draw runs in one figure; seeds become a mean and a band")
-    plot.add_argument("runs", metavar="RUN", nargs="+", type=Path, help="run folder")
+    plot.add_argument("runs", metavar="RUN", nargs="+", type=Path, help=_RUNS)
     plot.add_argument(
         "--output", metavar="FILE", type=Path, default=Path("fleetjax.png"), help="png, pdf or svg [default: fleetjax.png]"
     )
     plot.add_argument("--overwrite", action="store_true", help="replace an existing file")
 
-    evaluate = commands.add_parser("evaluate", help="run a trained policy without teleoperation")
+    _add_compare(commands)
+    evaluate = commands.add_parser("evaluate", help="run a trained policy without teleoperation", description=_EVALUATE_ABOUT)
     evaluate.add_argument("run", metavar="RUN", type=Path, help="run folder")
     evaluate.add_argument("--num-steps", metavar="N", type=_integer, default=10_000, help="timesteps [default: 10000]")
     evaluate.add_argument("--seed", metavar="N", type=_seed, help="random seed [default: the run's, plus 1]")
-    evaluate.add_argument("--overwrite", action="store_true", help="replace the evaluation in the run folder")
+    evaluate.add_argument("--overwrite", action="store_true", help="replace an older evaluation.json in the run folder")
 
     export = commands.add_parser("export", help="write a run's interventions as a data set", description=_EXPORT_ABOUT)
     export.add_argument("run", metavar="RUN", type=Path, help="run folder")
@@ -140,6 +164,36 @@ def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser
     return parser, list(commands.choices)
 
 
+def _add_compare(commands: Any) -> None:
+    usage = "fleetjax compare DIR... [--against GROUP] [--metric NAME]... [--output FILE]... [--rows FILE.csv]"
+    about = {"help": "compare runs in tables: means, intervals, differences", "description": _COMPARE_ABOUT}
+    compare = commands.add_parser("compare", usage=usage, **about)
+    compare.add_argument("runs", metavar="DIR", nargs="+", type=Path, help=_RUNS)
+    compare.add_argument("--against", metavar="GROUP", help="group to compare with: an algorithm, or a name in the table")
+    compare.add_argument(
+        "--metric",
+        metavar="NAME",
+        action="append",
+        help="column of metrics.csv (its total counts), rohe, or rohe_with_demonstrations, for which extra demonstrations "
+        "count as human time; may be repeated [default: successes, violations, idle and rohe]",
+    )
+    compare.add_argument(
+        "--output",
+        metavar="FILE",
+        action="append",
+        type=Path,
+        default=[],
+        help="table (md, csv) or figure (png, pdf, svg); may be repeated [default: print the table]",
+    )
+    compare.add_argument(
+        "--rows", metavar="FILE.csv", type=Path, help="also store a row for each run, from which compare can start again"
+    )
+    compare.add_argument(
+        "--allow-different", action="store_true", help="compare runs of different length or size, and interrupted ones"
+    )
+    compare.add_argument("--overwrite", action="store_true", help="replace existing files")
+
+
 def _add_run(commands: Any, environment: str | None) -> None:
     usage = "fleetjax run ENV [--seed N] [--output DIR] [--overwrite] [--checkpoint-every N] [parameters]\n"
     usage += "       fleetjax run --resume RUN"
@@ -163,15 +217,56 @@ def _add_run(commands: Any, environment: str | None) -> None:
     _add_parameters(run, environment)
 
 
+def _add_sweep(commands: Any, environment: str | None) -> None:
+    usage = "fleetjax sweep ENV... --output DIR [--seeds N] [--workers W] [parameters, each with a list of values]\n"
+    usage += "       fleetjax sweep FILE.toml [the same]"
+    sweep = commands.add_parser(
+        "sweep", help="run every combination of several values, in parallel", usage=usage, description=_SWEEP_ABOUT
+    )
+    environments = f"environments: {', '.join(list_envs())}; or a .toml file that says what to run"
+    sweep.add_argument("subjects", metavar="ENV|FILE", nargs="*", type=listed(str), help=environments)
+    options: dict[str, Any] = {"default": argparse.SUPPRESS}
+    sweep.add_argument("--seeds", metavar="N", type=_integer, help="as many seeds: 0 to N - 1 [default: 1]", **options)
+    sweep.add_argument("--seed", metavar="N,...", type=listed(_seed), help="these seeds", **options)
+    sweep.add_argument("--output", metavar="DIR", type=Path, help="folder for the run folders", **options)
+    workers = "processes, which share the cores [default: one for each core]"
+    sweep.add_argument("--workers", metavar="W", type=_integer, help=workers, **options)
+    every = "timesteps between the checkpoints of a run; 0 = none [default: 1000]"
+    sweep.add_argument("--checkpoint-every", metavar="N", type=_integer, help=every, **options)
+    logged = "log what teleoperating humans see and do, for `fleetjax export`"
+    sweep.add_argument("--log-interventions", action="store_true", help=logged, **options)
+    _add_parameters(sweep, environment, with_lists=True)
+
+
+def _add_calibrate(commands: Any, environment: str | None) -> None:
+    usage = "fleetjax calibrate ENV --human-time X [--field NAME] [--algorithm A] [--seeds N] [parameters]"
+    calibrate = commands.add_parser(
+        "calibrate", help="find the threshold that spends a given human time", usage=usage, description=_CALIBRATE_ABOUT
+    )
+    calibrate.add_argument("environment", metavar="ENV", nargs="?", default=argparse.SUPPRESS, help="environment")
+    wanted = "human timesteps that a run should spend, hard resets included"
+    calibrate.add_argument("--human-time", metavar="X", type=_number, help=wanted)
+    calibrate.add_argument("--field", metavar="NAME", help="parameter to find [default: the algorithm's threshold]")
+    calibrate.add_argument("--first-seed", metavar="N", type=_seed, default=0, help="seed of the search [default: 0]")
+    calibrate.add_argument("--seeds", metavar="N", type=_integer, default=3, help="seeds in all [default: 3]")
+    near = "relative difference that is near enough [default: 0.05]"
+    calibrate.add_argument("--tolerance", metavar="X", type=_number, default=0.05, help=near)
+    calibrate.add_argument("--most", metavar="N", type=_integer, default=10, help="runs of the search at most [default: 10]")
+    calibrate.add_argument("--output", metavar="DIR", type=Path, help="folder of its runs [default: below runs/]")
+    every = "timesteps between the checkpoints of a run; 0 = none [default: 1000]"
+    calibrate.add_argument("--checkpoint-every", metavar="N", type=_integer, default=1000, help=every)
+    _add_parameters(calibrate, environment)
+
+
 def _add_console(commands: Any, environment: str | None) -> None:
-    usage = "fleetjax console ENV --humans M [--host HOST --token TOKEN] [--port N] [--output DIR] [parameters]"
+    usage = "fleetjax console ENV [--humans M] [--host HOST --token TOKEN] [--port N] [--output DIR] [parameters]"
     console = commands.add_parser(
         "console", help="let people supervise a fleet in their browsers", usage=usage, description=_CONSOLE_ABOUT
     )
     console.add_argument("environment", metavar="ENV", nargs="?", default=argparse.SUPPRESS, help="environment with pictures")
     console.add_argument("--host", default="127.0.0.1", help="address to listen on; any but this machine's own needs --token")
     console.add_argument("--port", metavar="N", type=_integer, default=PORT, help=f"port; 0 = any free one [default: {PORT}]")
-    console.add_argument("--token", help="token that pages need as ?token=TOKEN; at least 8 letters and digits")
+    console.add_argument("--token", help="token that pages need as ?token=TOKEN: 8 to 128 letters, digits, or . _ ~ -")
     console.add_argument("--interval", metavar="X", type=_number, help="seconds per timestep [default: the control step]")
     console.add_argument(
         "--timeout",
@@ -193,29 +288,56 @@ def _add_console(commands: Any, environment: str | None) -> None:
     _add_parameters(console, environment, short={"num_humans": "--humans"})
 
 
-def _add_parameters(command: Any, environment: str | None, short: Mapping[str, str] = MappingProxyType({})) -> None:
+def _add_parameters(
+    command: Any,
+    environment: str | None,
+    short: Mapping[str, str] = MappingProxyType({}),
+    *,
+    with_lists: bool = False,
+) -> None:
     """Add a flag for each field of `Config`, with a short form for some, and for each parameter of an algorithm."""
+    add = _add_list if with_lists else _add_field
     fields = command.add_argument_group(f"parameters{f' (defaults of {environment})' if environment else ''}")
     own = command.add_argument_group("parameters of one algorithm each")
     for name, field in every_field().items():
         if name in FIELDS and name != "environment":
-            _add_field(fields, name, field, environment, *([short[name]] if name in short else []))
+            add(fields, name, field, environment, *([short[name]] if name in short else []))
         elif name not in FIELDS:
-            _add_field(own, name, field._replace(help=f"{', '.join(owners(name))}: {field.help}"), environment)
+            add(own, name, field._replace(help=f"{owners_in_words(name)}: {field.help}"), environment)
 
 
 def _add_field(group: Any, name: str, field: Field, environment: str | None, *short: str) -> None:
-    unit = f" ({field.unit})" if field.unit else ""
-    options: dict[str, Any] = {"default": argparse.SUPPRESS}
+    options: dict[str, Any] = {"default": argparse.SUPPRESS, "help": _help(name, field, environment)}
     if field.kind is bool:
         options |= {"action": argparse.BooleanOptionalAction}
     elif field.kind is tuple:
         options |= {"type": _integer, "nargs": "+", "metavar": "N"}
     else:
-        kinds = {str: (str, "NAME"), int: (_integer, "N"), float: (_number, "X")}
-        options["type"], options["metavar"] = kinds[field.kind]
-    text = f"{field.help}{unit} [default: {_default(name, field, environment)}]".replace("%", "%%")
-    group.add_argument(f"--{name.replace('_', '-')}", *short, help=text, **options)
+        options["type"], options["metavar"] = _KINDS[field.kind]
+    group.add_argument(_flag(name), *short, **options)
+
+
+def _add_list(group: Any, name: str, field: Field, environment: str | None) -> None:
+    """Add a flag that takes several values of a parameter, separated by commas, in place of one."""
+    options: dict[str, Any] = {"default": argparse.SUPPRESS, "help": _help(name, field, environment)}
+    if field.kind is tuple:
+        options |= {"action": sizes(_integer), "nargs": "+", "metavar": "N"}
+    else:
+        read, letter = _KINDS[field.kind]
+        options |= {"type": listed(read), "metavar": f"{letter},..."}
+    if field.kind is bool:
+        options |= {"nargs": "?", "const": [True]}
+        group.add_argument(f"--no-{_flag(name)[2:]}", dest=name, action="store_const", const=[False], default=argparse.SUPPRESS)
+    group.add_argument(_flag(name), **options)
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def _help(name: str, field: Field, environment: str | None) -> str:
+    unit = f" ({field.unit})" if field.unit else ""
+    return f"{field.help}{unit} [default: {_default(name, field, environment)}]".replace("%", "%%")
 
 
 def _default(name: str, field: Field, environment: str | None) -> str:
@@ -249,7 +371,21 @@ def _number(text: str) -> float:
         raise argparse.ArgumentTypeError(f"{text!r} must be a number") from None
 
 
+def _switch(text: str) -> bool:
+    if text not in ("on", "off"):
+        raise argparse.ArgumentTypeError(f"{text!r} must be on or off")
+    return text == "on"
+
+
 def _seed(text: str) -> int:
     if not text.isascii() or not text.isdecimal() or int(text) > _LARGEST_SEED:
         raise argparse.ArgumentTypeError(f"{text!r} must be a whole number from 0 to {_LARGEST_SEED}")
     return int(text)
+
+
+_KINDS = {  # what reads a value, and what stands for it in the help
+    str: (str, "NAME"),
+    int: (_integer, "N"),
+    float: (_number, "X"),
+    bool: (_switch, "on|off"),
+}

@@ -79,9 +79,9 @@ def check_folder(path: Path, *, overwrite: bool) -> None:
     if not os.path.lexists(path) or (path.is_dir() and {found.name for found in path.iterdir()} <= {files.LOCK}):
         return
     if not is_run(path):
-        raise FileExistsError(f"{path} exists already and is not a run folder; choose another --output")
+        raise FileExistsError(f"{path} already exists and is not a run folder; choose another --output")
     if not overwrite:
-        raise FileExistsError(f"{path} exists already; choose another --output, or pass --overwrite")
+        raise FileExistsError(f"{path} already exists; choose another --output, or pass --overwrite")
 
 
 def prepare(run: Run) -> bool:
@@ -151,6 +151,13 @@ def identity(config: Config, seed: int) -> dict[str, Any]:
     return {"config": plain.to_plain(config), "seed": seed}
 
 
+def first_difference(asked: Run, found: Run) -> str:
+    """Return how the first setting that differs differs: "num_steps = 300, but the run has 120"; "" if none does."""
+    runs = (asked, found)
+    wanted, has = (plain.to_plain(x.config) | {"seed": x.seed, "log_interventions": x.logged} for x in runs)
+    return next((f"{name} = {value}, but the run has {has[name]}" for name, value in wanted.items() if value != has[name]), "")
+
+
 def write_policy(folder: Path, policy: PolicyState) -> None:
     """Write `policy.msgpack`: the ensemble's parameters [E, ...] and the normalizer, by flax's serialization."""
     files.write(folder / POLICY, serialization.to_bytes(_stored(policy)))
@@ -166,7 +173,8 @@ def _blame(path: Path) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError:
-        raise ValueError(f"{path} is missing, so this is not the folder of a finished run") from None
+        reason = "this is not a run folder" if path.name == CONFIG else "the run did not finish"
+        raise ValueError(f"{path} is missing, so {reason}") from None
     except RecursionError:
         raise ValueError(f"{path} is damaged: it is nested too deeply") from None
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError, csv.Error) as error:
@@ -218,8 +226,13 @@ def read_finished(run: Run) -> Metrics | None:
         if run.logged:
             read_interventions(run)
     except ValueError as error:
-        raise ValueError(f"{error}; start it again with --overwrite") from None
+        raise ValueError(f"{error}; delete the folder, or {from_the_start(run)}") from None
     return metrics
+
+
+def from_the_start(run: Run) -> str:
+    """Return the remedy for a run that can neither be resumed nor used."""
+    return f"run it from the start: fleetjax run {run.config.environment} ... --output {run.folder} --overwrite"
 
 
 def _versions_from(entries: Any) -> tuple[Mapping[str, Any], ...]:

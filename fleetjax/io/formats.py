@@ -18,4 +18,4 @@ def check(kind: str) -> None:
         raise ValueError(unknown("format", kind, FORMATS))
     for name in NEEDS[kind]:
         if importlib.util.find_spec(name) is None:
-            raise ValueError(f'--format {kind} needs {name}: pip install "fleetjax[{kind}]"')
+            raise ValueError(f'--format {kind} needs {name}; run pip install ".[{kind}]" in the source folder')

@@ -33,6 +33,12 @@ def append(log: files.Log, metrics: Metrics, first: int) -> None:
     log.append(rows.getvalue().encode())
 
 
+def count(folder: Path) -> int:
+    """Return the timesteps in the table of a run, even while it is written; 0 if there is none."""
+    path = folder / FILE
+    return max(0, path.read_bytes().count(b"\n") - 1) if path.exists() else 0
+
+
 def parse(data: bytes, num_steps: int) -> Metrics:
     """Return the Metrics[T] in the content of a table, as numpy arrays.
 

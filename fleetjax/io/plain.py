@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from fleetjax.config import Config, all_fields, get_value, validate
+from fleetjax.field import KINDS
 from fleetjax.io.files import expect
 
 _LARGEST = 2**31 - 1  # traced integers are i32
@@ -33,7 +34,7 @@ def from_plain(fields: Mapping[str, Any]) -> Config:
     for problem, names in (("unknown", set(fields) - set(known)), ("missing", set(known) - set(fields))):
         expect(not names, f"{problem} fields: {', '.join(sorted(names))} (another version of fleetjax?)")
     for name, value in fields.items():
-        expect(fits(value, known[name].kind), f"{name} = {value!r} must be of type {known[name].kind.__name__}")
+        expect(fits(value, known[name].kind), f"{name} = {value!r} must be {KINDS[known[name].kind]}")
     config = Config().replace(**{**fields, "human_capacity": 0})
     if fields["human_capacity"] not in (0, config.human_capacity):  # it was asked for, and does not follow from the others
         config = config.replace(human_capacity=fields["human_capacity"])

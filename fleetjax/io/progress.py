@@ -1,4 +1,4 @@
-"""Progress of a run on the screen: percent, rate, time left, and the live counts."""
+"""Progress on the screen: of a run, with its rate and live counts, and of many runs."""
 
 import contextlib
 import os
@@ -54,6 +54,43 @@ def progress(config: Config, before: Metrics | None = None, *, with_rohe: bool =
         def redraw(chunk: Metrics) -> None:
             line.set_description_str(counts(chunk))
             bar.update(len(chunk.successes))
+
+        yield redraw
+
+
+@contextlib.contextmanager
+def progress_of_many(num_runs: int, num_steps: int, done: int) -> Iterator[Callable[..., None]]:
+    """Yield `(ended, timesteps, news="", failed=False)`, which shows how many runs have ended, and tells news of one.
+
+    A terminal gets a bar that is redrawn, and news of failures above it; anything else gets all news, a line each.
+
+    Args:
+        num_runs: how many there are.
+        num_steps: timesteps of all of them.
+        done: how many of those were run already.
+    """
+    begun = time.monotonic()
+
+    def write(ended: int, timesteps: int, news: str = "", failed: bool = False) -> None:
+        del failed
+        rate = (timesteps - done) / max(time.monotonic() - begun, 1e-9)
+        left = f", {text.duration((num_steps - timesteps) / rate)} left" if rate > 0 else ""
+        if news:
+            say(f"{ended} of {num_runs} runs{left}: {news}")
+
+    if not _is_screen():
+        yield write
+        return
+    form = "{percentage:3.0f}% |{bar}| {desc}, {remaining} left"
+    options: dict[str, Any] = {"dynamic_ncols": True, "file": sys.stderr, "bar_format": form, "smoothing": 0}
+    with tqdm(total=num_steps, initial=done, **options) as bar:
+
+        def redraw(ended: int, timesteps: int, news: str = "", failed: bool = False) -> None:
+            if failed:
+                bar.write(news, file=sys.stderr)
+            bar.set_description_str(f"{ended} of {num_runs} runs", refresh=False)
+            bar.update(timesteps - bar.n)
+            bar.refresh()
 
         yield redraw
 

@@ -54,7 +54,7 @@ def check_format(path: Path) -> None:
     if path.suffix.lower() not in FORMATS:
         raise ValueError(f"{path} must end in one of {', '.join(FORMATS)}")
     if path.suffix.lower() == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
-        raise ValueError(f'{path} needs imageio with ffmpeg: pip install "fleetjax[video]", or choose a .gif')
+        raise ValueError(f'{path} needs imageio with ffmpeg; run pip install ".[video]" in the source folder, or choose a .gif')
 
 
 def check(config: Config) -> None:

@@ -1,7 +1,7 @@
 """A run in its folder: started or resumed, chunk after chunk, with checkpoints, until it ends or is stopped.
 
 A run that was killed and resumed gives the same bits as one that was not: chunks and checkpoints change nothing, the key of
-timestep t is `fold_in(key, t)`, and the files are cut back to the checkpoint's timestep.
+timestep t is `keys.key_at(key, t)`, and the files are cut back to the checkpoint's timestep.
 """
 
 import contextlib
@@ -38,6 +38,43 @@ class Start(NamedTuple):
     state: FleetState
     metrics: Metrics | None
     notes: Mapping[str, Any]
+
+
+def check_interval(checkpoint_every: int) -> None:
+    """Check the timesteps between checkpoints.
+
+    Raises:
+        ValueError: if there can be none that often.
+    """
+    if checkpoint_every < 0 or checkpoint_every == 1:
+        raise ValueError(f"checkpoint_every = {checkpoint_every} must be 0 (none) or at least 2 timesteps")
+
+
+def complete(run: folder.Run, *, checkpoint_every: int) -> None:
+    """Run what is left of a run, whatever its folder holds of it: nothing yet, a part, or all.
+
+    Args:
+        run: its folder and its configuration, and whether interventions are logged.
+        checkpoint_every: timesteps between checkpoints; 0 = none.
+
+    Raises:
+        ValueError: if the folder holds another run, or a damaged one.
+        BlockingIOError: if another process works on it.
+        Exception: as `run_in_folder` does.
+    """
+    run.folder.mkdir(parents=True, exist_ok=True)
+    with files.lock(run.folder):
+        begun = folder.is_run(run.folder)
+        if begun:
+            asked, run = run, folder.read_run(run.folder)
+            difference = folder.first_difference(asked, run)
+            if difference:
+                raise ValueError(f"{difference} in {run.folder}; choose another --output")
+            if folder.read_finished(run):
+                return
+        else:
+            folder.check_folder(run.folder, overwrite=False)
+        run_in_folder(run, resume=begun, checkpoint_every=checkpoint_every)
 
 
 def run_in_folder(run: folder.Run, *, resume: bool, checkpoint_every: int) -> Metrics:
@@ -125,7 +162,8 @@ def _resume(run: folder.Run) -> Start | None:
         say(f"skipped checkpoint {reason}")
     if found is None:
         if checkpoint.is_any_finished(run.folder):
-            raise Refusal(f"{run.folder} has no checkpoint that can be used; start it again with --overwrite")
+            reason = f"{run.folder} has no checkpoint that can be used"
+            raise Refusal(f"{reason}; delete the folder, or {folder.from_the_start(run)}")
         say("no checkpoint was written yet; starting from t = 0")
         return None
     say(f"resuming from {found.path}")
@@ -162,9 +200,8 @@ def _check(chunk: Metrics, done: int, run: folder.Run) -> None:
     found = first_divergence(chunk)
     if found:
         first, names = found
-        when = f"from t = {done - len(chunk.diverged) + first} on"
-        remedy = f"try a smaller learning_rate. The metrics so far are in {run.folder}"
-        raise Diverged(f"not finite {when}: {', '.join(names)}; {remedy}")
+        what = text.divergence(done - len(chunk.diverged) + first, names)
+        raise Diverged(f"{what}. The metrics so far are in {run.folder}")
 
 
 def unbegun(run: folder.Run, *, new: bool) -> KeyboardInterrupt:
@@ -178,7 +215,7 @@ def seal(run: folder.Run, metrics: Metrics) -> None:
     """Draw what there is, and store the SHA-256 of all files."""
     from fleetjax.io import figure  # matplotlib takes a while to import
 
-    drawn = figure.draw(figure.group([(run.config, run.seed, metrics)]), text.headline(run.config, run.seed))
+    drawn = figure.plot([(run.config, run.seed, metrics)], text.headline(run.config, run.seed))
     files.write(run.folder / folder.FIGURE, figure.render(drawn))
     folder.write_config(run, sealed=True)
 

@@ -15,16 +15,16 @@ _KNOWN = {
         "the policy cloned at the start; humans only reset robots in violation (the paper's BC)",
     ),
     "constraint_trained": (
-        "Constraint, trained out",
-        "the same, with as many gradient steps before the start as the others take in total",
+        "Constraint, trained longer",
+        "as constraint, but with as many gradient steps before the start as the others take in total",
     ),
-    "random": ("Random", "robots get help at random, if their random score reaches random_threshold"),
+    "random": ("Random", "each robot draws a random score; those at or above random_threshold get help, highest first"),
     "ensemble_dagger": ("Fleet-EnsembleDAgger", "uncertain robots first, then robots in violation"),
     "thrifty_dagger": (
         "Fleet-ThriftyDAgger",
         "robots that are uncertain or unlikely to reach their goal first, then robots in violation",
     ),
-    "expert": ("Expert", "every robot is teleoperated and nothing is learnt: the upper bound"),
+    "expert": ("Expert", "every robot is teleoperated and nothing is learnt: an upper bound on successes"),
     "cur": ("C.U.R.", "robots in violation first, then by uncertainty, then by risk: the paper's proposal"),
 }
 ORDERS = "any order of distinct letters from c (violation), u (uncertainty) and r (risk); uc: first uncertainty, then violation"
@@ -115,12 +115,41 @@ def table(rows: Iterable[Sequence[str]], *, right: Sequence[int] = ()) -> str:
     return "\n".join(map(line, rows))
 
 
+def markdown_table(rows: Iterable[Sequence[str]]) -> str:
+    """Return rows, the first of which is the head, as a Markdown table; all columns but the first are aligned to the right.
+
+    >>> print(markdown_table([("group", "seeds"), ("C.U.R.", "5")]))
+    | group  | seeds |
+    |--------|------:|
+    | C.U.R. |     5 |
+    """
+    rows = [tuple(row) for row in rows]
+    first, *widths = (max(map(len, column)) for column in zip(*rows, strict=True))
+    lines = [[row[0].ljust(first), *(cell.rjust(w) for cell, w in zip(row[1:], widths, strict=True))] for row in rows]
+    head, *body = (f"| {' | '.join(line)} |" for line in lines)
+    rule = "|".join(["-" * (first + 2), *("-" * (w + 1) + ":" for w in widths)])
+    return "\n".join([head, f"|{rule}|", *body])
+
+
 def headline(config: Config, seed: int) -> str:
     """Return what is run, in one line."""
     return (
         f"{label(config.algorithm)} on {config.environment}: {plural(config.num_robots, 'robot')}, "
         f"{plural(config.num_humans, 'human')}, {plural(config.num_steps, 'timestep')}, seed {seed}"
     )
+
+
+def divergence(timestep: int, names: Sequence[str]) -> str:
+    """Return what is no longer finite, since when, and what to try.
+
+    >>> divergence(12, ["policy"])
+    'the policy has NaN or infinite numbers from t = 12 on; try a smaller learning_rate'
+    >>> divergence(12, ["policy", "another estimator"])
+    'the policy and another estimator have NaN or infinite numbers from t = 12 on; try a smaller learning_rate'
+    """
+    what = " and ".join(name if name.startswith("another") else f"the {name}" for name in names)
+    have = "has" if len(names) == 1 else "have"
+    return f"{what} {have} NaN or infinite numbers from t = {timestep} on; try a smaller learning_rate"
 
 
 def add_up(metrics: Metrics) -> dict[str, float]:

@@ -71,7 +71,7 @@ def register_estimator(name: str, make_estimator: Callable[[Config, Env, Learner
 def _of_critic(kind: str) -> Callable[[Config, Env, Learner, Supervisor], Estimator]:
     """Return the maker of an estimator by a twin critic.
 
-    The safety critic's offline transitions are the first clone's, the goal critic's the supervisor's.
+    Offline, the cloned policy acts for the safety critic, and the supervisor acts for the goal critic.
 
     Reference: paper, Section 4.2 and Appendix (training critic Q-functions).
     """

@@ -1,4 +1,4 @@
-"""A robot's physics by name: a model of the package, bound to a backend."""
+"""A robot's physics: a MuJoCo model, bound to a backend."""
 
 from pathlib import Path
 
@@ -28,10 +28,10 @@ def resolve_backend(backend: str) -> str:
 
 
 def make_physics(model_file: str, *, substeps: int, backend: str = "auto") -> Physics:
-    """Load a model from the package and bind it to a backend.
+    """Load a MuJoCo model and bind it to a backend.
 
     Args:
-        model_file: file name below `fleetjax/physics/models`.
+        model_file: file name below `fleetjax/physics/models`, or the absolute path of a model of your own.
         substeps: simulation steps in one control step.
         backend: `"native"` (MuJoCo C on CPU threads), `"mjx"` (pure JAX) or `"auto"`.
 

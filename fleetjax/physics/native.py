@@ -1,6 +1,6 @@
 """MuJoCo's C engine behind the physics contract: a thread pool, reached from JAX by a callback.
 
-The whole batch of robots crosses to the host once a control step. Robots that stand still are skipped, and
+The whole batch of robots crosses to the host once per control step. Robots that stand still are skipped, and
 a diverged robot (MuJoCo resets it or stops it early) is recognised by its clock.
 """
 
@@ -24,7 +24,7 @@ def num_threads() -> int:
 
 
 class _Simulator:
-    """The host side: MuJoCo's thread pool and one `MjData` a thread."""
+    """The host side: MuJoCo's thread pool and one `MjData` per thread."""
 
     def __init__(self, model: mujoco.MjModel, substeps: int):
         mujoco.set_mju_user_warning(lambda message: None)  # else divergence writes a log into the working folder

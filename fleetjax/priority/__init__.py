@@ -1,6 +1,6 @@
-"""Rules for who gets help: from signals of the robots to scores (paper, Section 4.2). One file a family.
+"""Rules for who gets help: from signals of the robots to scores (paper, Section 4.2). One file per family.
 
-A priority is two pure functions. A new one is about ten lines:
+A rule is a `Priority`: two pure functions. A new one is about ten lines:
 
     def make_least_certain(config):
         def score(signals, aux, key):
@@ -23,7 +23,7 @@ from fleetjax.priority.base import (
 )
 from fleetjax.priority.baselines import BASELINES
 from fleetjax.priority.dagger import DAGGERS
-from fleetjax.priority.orders import ORDERS
+from fleetjax.priority.orders import RULES
 from fleetjax.priority.ranks import above, lexicographic
 
 __all__ = [
@@ -39,5 +39,5 @@ __all__ = [
     "stateless",
 ]
 
-for _name, _algorithm in {**BASELINES, **DAGGERS, **ORDERS}.items():
+for _name, _algorithm in {**BASELINES, **DAGGERS, **RULES}.items():
     register_algorithm(_name, _algorithm)

@@ -1,4 +1,4 @@
-"""What a rule for help is made of: a priority, an allocator, what it learns, and parameters of its own."""
+"""What an algorithm is made of: a rule for help, an allocator, what it learns, and parameters of its own."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -25,13 +25,13 @@ class Priority(NamedTuple):
 
 
 def stateless(score: Callable[[Signals, jax.Array], jax.Array]) -> Priority:
-    """Return the priority that scores by `(Signals[N], key) -> f32[N]` and remembers nothing."""
+    """Return the rule that scores by `(Signals[N], key) -> f32[N]` and remembers nothing."""
     return Priority(init=lambda: (), score=lambda signals, aux, key: (score(signals, key), aux))
 
 
 @dataclasses.dataclass(frozen=True)
 class Algorithm:
-    """A rule for help, and what the fleet must do and learn for it.
+    """A rule for help, an allocator, and what the fleet must do and learn for them.
 
     Attributes:
         make_priority: `config -> Priority`.
@@ -76,7 +76,7 @@ def register_priority(
     estimators: tuple[str, ...] = ("safety",),
     parameters: Mapping[str, Field] | None = None,
 ) -> None:
-    """Make a priority available as an algorithm that clones demonstrations and learns from interventions.
+    """Make a rule available as an algorithm that clones demonstrations and learns from interventions.
 
     Args:
         name: what `make_config` calls it.

@@ -2,7 +2,7 @@
 
 Each expert is an npz, and a JSON of its measured returns (see `fleetjax.expert_records`); `experiments/train_expert.py` writes
 both. The npz holds the mean and standard deviation of observations, and dense layers with ELU between them. Behind the last
-stands tanh, or the bound at which it is clipped; where it only changes the last action, also by how much at most.
+stands tanh, or the bound at which it is clipped.
 """
 
 import functools
@@ -44,13 +44,7 @@ def policy(weights: Mapping[str, jax.Array | np.ndarray], obs: jax.Array, view: 
     for i in range(layers):
         x = x @ weights[f"kernel_{i}"] + weights[f"bias_{i}"]
         x = jax.nn.elu(x) if i < layers - 1 else x
-    x = jnp.clip(x, -weights["bound"], weights["bound"]) if "bound" in weights else jnp.tanh(x)
-    return add_to_last(obs, jnp.asarray(weights["step_size"] * x)) if "step_size" in weights else x
-
-
-def add_to_last(obs: jax.Array, change: jax.Array) -> jax.Array:
-    """Return the last action f32[..., A], with which observations f32[..., O] end, changed and clipped to [-1, 1]."""
-    return jnp.clip(obs[..., -change.shape[-1] :] + change, -1.0, 1.0)
+    return jnp.clip(x, -weights["bound"], weights["bound"]) if "bound" in weights else jnp.tanh(x)
 
 
 def score(
@@ -62,7 +56,7 @@ def score(
     key: jax.Array,
     view: View = everything,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Run one episode a robot under a policy.
+    """Run one episode per robot under a policy.
 
     Args:
         env: the environment.

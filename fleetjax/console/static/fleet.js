@@ -63,7 +63,8 @@ function drawCurves(places, curves) {
 }
 
 function showSeat(seat, i) {
-  const does = seat.robot < 0 ? "free" : `${seat.resets ? "resets" : "helps"} robot ${seat.robot}`;
+  const helps = seat.waits ? `robot ${seat.robot} waits for R` : `${seat.resets ? "resets" : "helps"} robot ${seat.robot}`;
+  const does = seat.robot < 0 ? "free" : helps;
   const item = byId("seats").children[i];
   write(item, `Seat ${i + 1} (${seat.who}): ${seat.who === "empty" ? "nobody there" : does}`);
   item.dataset.who = seat.who;
@@ -83,9 +84,12 @@ function showRobot(robot, i, message) {
   const data = message.pictures[i];
   if (data) picture.src = data;
   picture.hidden = !data;
-  const helper = robot.helper < 0 ? "" : `seat ${robot.helper + 1} `;
-  const does = robot.violation ? (helper ? `${helper}resets` : "stuck, waits") : helper ? `${helper}helps` : "by itself";
+  const helped = robot.helper >= 0;
+  const alone = robot.violation ? "stuck, waits" : "by itself";
+  const waits = helped && message.seats[robot.helper].waits;
+  const help = waits ? `waits for R from seat ${robot.helper + 1}` : `seat ${robot.helper + 1} ${robot.violation ? "resets" : "helps"}`;
+  const does = helped ? help : alone;
   write(text, does);
-  item.dataset.state = robot.violation ? "violation" : helper ? "helped" : "moving";
+  item.dataset.state = robot.violation ? "violation" : helped ? "helped" : "moving";
   item.title = `uncertainty ${robot.uncertainty}, risk ${robot.risk}`;
 }

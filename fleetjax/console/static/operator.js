@@ -27,7 +27,7 @@ const send = connect("/ws/operator", {
   left: () => stand("You have left your seat."),
   waiting: (message) => {
     send({ type: "seen" });
-    say(`You have a seat. The session starts when ${message.wanted} people are here; now there are ${message.people}.`);
+    say(`You have a seat. The session starts when ${message.wanted} people are here; so far: ${message.people} of ${message.wanted}.`);
   },
   ping: () => send({ type: "seen" }),
   state: update,
@@ -218,8 +218,8 @@ function layPad() {
     return button;
   }));
   write(byId("hint"), facts.hold
-    ? "Hold arrow keys or W A S D; the space bar brakes. While you hold nothing, the robot acts by itself."
-    : "Arrow keys or W A S D: one push a timestep, and the last press counts. While you press nothing, the robot acts by itself.");
+    ? "Hold arrow keys or W A S D; the space bar lets it coast to a stop. While you hold nothing, the robot acts by itself."
+    : "Arrow keys or W A S D: one push per timestep, and the last press counts. While you press nothing, the robot acts by itself.");
 }
 
 addEventListener("keydown", (event) => {

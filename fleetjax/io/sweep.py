@@ -1,0 +1,118 @@
+"""A sweep in its folder: many runs, in several processes that have cores of their own.
+
+The runs' folders are all that is kept, besides `sweep.json`, which says what the sweep is. So a sweep that was stopped or
+killed resumes by what they hold: finished runs are skipped, others resume from their checkpoints. Each process locks the folder
+of its run.
+"""
+
+import contextlib
+import json
+import os
+import time
+from collections.abc import Sequence
+
+from fleetjax.io import crew, files, folder, metrics_csv, resumable, text
+from fleetjax.io.errors import Incomplete
+from fleetjax.io.progress import progress_of_many, say
+from fleetjax.io.study import Study, plan
+
+FILE, LOGS = "sweep.json", "logs"
+
+
+def check_folder(study: Study, runs: Sequence[folder.Run]) -> None:
+    """Check that the folder of a sweep is new or empty, or holds a part of the same sweep.
+
+    Raises:
+        ValueError: if it does not; the message has the first difference.
+    """
+    path = study.output
+    if not (path / FILE).exists():
+        free = not os.path.lexists(path) or (path.is_dir() and {found.name for found in path.iterdir()} <= {files.LOCK})
+        files.expect(free, f"{path} exists already and is not the folder of a sweep; choose another --output")
+        return
+    here = {run.folder: run for run in runs}
+    for run in _read(study):
+        files.expect(
+            run.folder in here,
+            f"{path} holds another sweep, with a run {run.folder.name} that this one lacks; choose another --output",
+        )
+        difference = folder.first_difference(here[run.folder], run)
+        files.expect(not difference, f"{run.folder.name}: {difference} in {path}; choose another --output")
+
+
+def _read(study: Study) -> list[folder.Run]:
+    """Return the runs of the sweep that the folder holds.
+
+    Raises:
+        ValueError: if what says so is damaged.
+    """
+    path = study.output / FILE
+    try:
+        content = json.loads(path.read_bytes())
+        return plan(study._replace(blocks=tuple(content["runs"]), logged=content["log_interventions"]))
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise ValueError(f"{path} cannot be used: {files.one_line(error)}; choose another --output") from None
+
+
+def run_all(study: Study, runs: Sequence[folder.Run]) -> None:
+    """Complete all runs of a sweep whose folder was checked.
+
+    Raises:
+        Incomplete: if some failed.
+        KeyboardInterrupt: if it was asked to stop; the message says how to resume it.
+    """
+    begun = time.monotonic()
+    study.output.mkdir(parents=True, exist_ok=True)
+    with files.lock(study.output):
+        files.write_json(study.output / FILE, {"runs": study.blocks, "log_interventions": study.logged})
+        (study.output / LOGS).mkdir(exist_ok=True)
+        waiting = [run for run in runs if not _is_finished(run)]
+        finished, all_runs = len(runs) - len(waiting), text.plural(len(runs), "run")
+        say(f"{all_runs}, {finished} of them finished already")
+        try:
+            failed = _complete(study, runs, waiting)
+        except KeyboardInterrupt:
+            finished = sum(map(_is_finished, runs))
+            raise KeyboardInterrupt(f"with {finished} of {all_runs} finished; repeat the command to resume") from None
+    if failed:
+        raise Incomplete(f"{failed} of {all_runs} failed; repeat the command to try again; delete a damaged run folder first")
+    print(f"{all_runs} finished, {text.duration(time.monotonic() - begun)} in all. Folder: {study.output}")
+
+
+def _is_finished(run: folder.Run) -> bool:
+    try:
+        found = folder.read_run(run.folder)
+        return not folder.first_difference(run, found) and folder.read_finished(found) is not None
+    except (OSError, ValueError):  # which a worker will meet again, and tell
+        return False
+
+
+def _complete(study: Study, runs: Sequence[folder.Run], waiting: Sequence[folder.Run]) -> int:
+    """Complete the runs that wait, and show how all of them stand.
+
+    Returns:
+        int: how many failed.
+
+    Raises:
+        KeyboardInterrupt: if it was asked to stop before all had ended.
+    """
+    logs = study.output / LOGS
+    timesteps = {run.folder: metrics_csv.count(run.folder) for run in runs}
+    ended, failed = len(runs) - len(waiting), 0
+    with (
+        progress_of_many(len(runs), sum(run.config.num_steps for run in runs), sum(timesteps.values())) as show,
+        resumable.stoppable() as asked_to_stop,
+        contextlib.closing(crew.Crew(waiting, study.workers, study.checkpoint_every, logs)) as workers,
+    ):
+        while workers.busy:
+            for run, reason in workers.wait():
+                ended, failed, timesteps[run.folder] = ended + 1, failed + bool(reason), run.config.num_steps
+                news = f"failed: {reason}; its log is {logs / run.folder.name}.log" if reason else "finished"
+                show(ended, sum(timesteps.values()), f"{run.folder.name} {news}", failed=bool(reason))
+            timesteps |= {run.folder: metrics_csv.count(run.folder) for run in workers.busy}
+            show(ended, sum(timesteps.values()))
+            if asked_to_stop():
+                workers.stop()
+    if ended < len(runs):
+        raise KeyboardInterrupt
+    return failed

@@ -1,0 +1,97 @@
+"""Find where a number that is slow to measure takes a given value: a few measurements, no derivative, no monotony assumed."""
+
+import itertools
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+FIRST_STEP = math.log(3)  # in the scaled parameter
+LIMIT = 16.0  # of the scaled parameter: from about 1e-7 to 1e7, or so near to 0 and 1
+
+
+class Scale(NamedTuple):
+    """How a parameter is searched: by its logarithm, or by its log-odds where 1 is its largest value.
+
+    Attributes:
+        bounded: whether it lies between 0 and 1.
+    """
+
+    bounded: bool
+
+    def inward(self, value: float) -> float:
+        """Return the scaled parameter."""
+        value = max(value, math.exp(-LIMIT))
+        return math.log(value) - (math.log(max(1 - value, math.exp(-LIMIT))) if self.bounded else 0.0)
+
+    def outward(self, scaled: float) -> float:
+        """Return the parameter.
+
+        >>> scale = Scale(bounded=True)
+        >>> round(scale.outward(scale.inward(0.998)), 6)
+        0.998
+        """
+        return 1 / (1 + math.exp(-scaled)) if self.bounded else math.exp(scaled)
+
+
+def solve(
+    measure: Callable[[float], float], wanted: float, start: float, scale: Scale, *, tolerance: float, most: int
+) -> list[tuple[float, float]]:
+    """Measure at one value after another, until one gives what is wanted or no measurement is left.
+
+    From `start` the search takes growing steps both ways, towards smaller numbers first where too much was measured, until two
+    neighbours lie on both sides of what is wanted. Between them it interpolates.
+
+    Args:
+        measure: `value -> number`, at least 0.
+        wanted: the number that is wanted, more than 0.
+        start: the first value.
+        scale: of the values.
+        tolerance: relative difference that is near enough.
+        most: measurements at most.
+
+    Returns:
+        Values and what was measured there, in order; the nearest need not be the last.
+
+    >>> found = solve(lambda value: 100 / value, 40.0, 1.0, Scale(bounded=False), tolerance=0.01, most=8)
+    >>> round(found[-1][0], 2), len(found) <= 5
+    (2.5, True)
+    """
+    tried: dict[float, float] = {}
+    scaled = scale.inward(start)
+    while len(tried) < most:
+        tried[scaled] = measure(scale.outward(scaled))
+        if abs(tried[scaled] - wanted) <= tolerance * wanted:
+            break
+        following = _between(tried, wanted)
+        if following is None:
+            following = _beyond(tried, wanted)
+        if following is None:
+            break
+        scaled = following
+    return [(scale.outward(scaled), number) for scaled, number in tried.items()]
+
+
+def _between(tried: dict[float, float], wanted: float) -> float | None:
+    """Return where to measure between two neighbours that lie on both sides; the narrowest such pair is taken."""
+    places = sorted(tried)
+    pairs = [(a, b) for a, b in itertools.pairwise(places) if (tried[a] > wanted) != (tried[b] > wanted)]
+    if not pairs:
+        return None
+    a, b = min(pairs, key=lambda pair: pair[1] - pair[0])
+    if b - a < 1e-4:
+        return None
+    high, low, goal = (math.log1p(x) for x in (tried[a], tried[b], wanted))
+    share = (goal - high) / (low - high)
+    return a + (b - a) * min(max(share, 0.15), 0.85)  # else one end could stay for ever
+
+
+def _beyond(tried: dict[float, float], wanted: float) -> float | None:
+    """Return where to measure outside of all values so far, now on one side, now on the other; None if both are exhausted."""
+    places = sorted(tried)
+    step = FIRST_STEP * 1.5 ** (len(places) - 1)
+    up, down = places[-1] + step, places[0] - step
+    upward = tried[places[0]] > wanted  # what is asked for mostly falls with a threshold
+    if len(places) >= 3 and abs(tried[places[0 if upward else -1]] - wanted) < abs(tried[places[-1 if upward else 0]] - wanted):
+        upward = not upward  # the other end is nearer
+    order = (up, down) if upward else (down, up)
+    return next((place for place in order if abs(place) <= LIMIT), None)

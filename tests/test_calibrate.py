@@ -1,0 +1,67 @@
+"""`fleetjax calibrate`: the value of a parameter at which an algorithm spends a given human time."""
+
+import json
+
+import pytest
+from commands import refused
+
+from fleetjax import cli
+from fleetjax.io import folder
+
+SMALL = [
+    *("navigation", "--algorithm", "random", "--num-robots", "20", "--num-humans", "4", "--num-steps", "60"),
+    *("--gradient-steps", "0", "--pretraining-steps", "1", "--num-demonstrations", "128", "--hidden-sizes", "8"),
+]
+
+
+def calibrate(path, *arguments: object) -> int:
+    return cli.main(["calibrate", *SMALL, "--output", str(path), *map(str, arguments)])
+
+
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory):
+    path = tmp_path_factory.mktemp("calibration")
+    assert calibrate(path, "--human-time", 120, "--seeds", 3, "--tolerance", 0.1) == 0
+    return path
+
+
+def test_the_value_spends_the_time_in_runs_that_anyone_can_look_at(solved):
+    found = json.loads((solved / "calibration.json").read_text())
+    assert found["solved"]
+    assert found["field"] == "random_threshold"
+    spent = []
+    for seed in range(3):
+        run = folder.read_run(solved / f"random_threshold-{found['value']:.6g}-seed{seed}")
+        assert float(run.config.parameters["random_threshold"]) == pytest.approx(found["value"])
+        spent.append(int(folder.read_metrics(run).human_steps.sum()))
+    assert spent == found["human_time"]
+    assert sum(spent) / 3 == pytest.approx(120, rel=0.1)
+    assert 0 < found["error"] < 0.5
+
+
+def test_the_same_command_answers_from_what_it_ran(solved, capsys):
+    before = {path: path.stat().st_mtime_ns for path in solved.glob("*/metrics.csv")}
+    assert calibrate(solved, "--human-time", 120, "--seeds", 3, "--tolerance", 0.1) == 0
+    assert {path: path.stat().st_mtime_ns for path in solved.glob("*/metrics.csv")} == before
+    assert capsys.readouterr().out.startswith("random_threshold = 0.9")
+
+
+def test_the_nearest_is_told_where_nothing_spends_so_much(tmp_path, capsys):
+    assert calibrate(tmp_path, "--human-time", 239, "--seeds", 1, "--most", 2, "--tolerance", 0.001) == 0
+    assert "No value that was tried spends 239; this one is the nearest." in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "--human-time is missing"),
+        (["--human-time", "300"], "human_time = 300 must lie between 0 and 240"),
+        (["--human-time", "100", "--field", "num_robots"], "field = 'num_robots' must be a real-valued traced field; choose"),
+        (["--human-time", "100", "--field", "uncertainty"], "field = 'uncertainty' must be a real-valued traced field"),
+        (["--human-time", "100", "--seeds", "0"], "seeds must name one or more"),
+        (["--human-time", "100", "--most", "0"], "most = 0 must be at least 1"),
+    ],
+)
+def test_what_cannot_be_found_is_refused(tmp_path, capsys, arguments, words):
+    assert words in refused(capsys, "calibrate", *SMALL, "--output", tmp_path / "new", *arguments)
+    assert not (tmp_path / "new").exists()

@@ -1,0 +1,511 @@
+"""Many runs with one command: which they are, what is refused, and that stops and kills lose nothing."""
+
+import contextlib
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import pytest
+from commands import contents, refused
+
+from fleetjax import cli
+from fleetjax.io import crew, flags, folder, resumable, study, sweep
+
+STEPS = 3000
+TINY = [
+    *("--num-robots", "2", "--num-humans", "2", "--num-steps", str(STEPS), "--hard-reset-time", "2"),
+    *("--hidden-sizes", "8", "--ensemble-size", "2", "--batch-size", "8", "--critic-capacity", "300"),
+    *("--num-demonstrations", "20", "--pretraining-steps", "5", "--checkpoint-every", "200"),
+]
+RESULTS = ("metrics.csv", "policy.msgpack")
+
+
+def planned(*arguments: object, output: Path = Path("out")) -> dict[str, folder.Run]:
+    """Return the runs of a sweep by the names of their folders."""
+    asked = flags.parse(["sweep", *map(str, arguments), "--output", str(output)])
+    runs = study.plan(study.make_study([name for names in asked.subjects for name in names], vars(asked)))
+    assert {run.folder.parent for run in runs} == {output}
+    return {run.folder.name: run for run in runs}
+
+
+def settings(runs: dict[str, folder.Run]) -> dict[str, dict]:
+    return {name: folder.identity(run.config, run.seed) | {"logged": run.logged} for name, run in runs.items()}
+
+
+# Which runs there are
+
+
+def test_a_sweep_is_the_product_of_its_lists_and_names_say_what_differs():
+    runs = planned("navigation", "block_push", "--algorithm", "cur,uc", "--num-humans", "1,2", "--num-robots", 3, "--seeds", 2)
+    assert list(runs) == [
+        f"{environment}-{algorithm}-num_humans={humans}-seed{seed}"
+        for environment in ("navigation", "block_push")
+        for algorithm in ("cur", "uc")
+        for humans in (1, 2)
+        for seed in (0, 1)
+    ]
+    run = runs["block_push-uc-num_humans=2-seed1"]
+    config = run.config
+    assert (config.environment, config.algorithm, config.num_humans, run.seed) == ("block_push", "uc", 2, 1)
+    assert config.num_robots == 3
+    assert list(planned("navigation")) == ["navigation-cur-seed0"]
+    assert list(planned("navigation", "--seed", "7,3")) == ["navigation-cur-seed7", "navigation-cur-seed3"]
+
+
+def test_a_parameter_of_one_algorithm_is_given_to_it_alone():
+    runs = planned("navigation", "--algorithm", "cur,random", "--random-threshold", "0.5,0.75")
+    names = ["navigation-cur-seed0", "navigation-random-random_threshold=0.5-seed0"]
+    assert list(runs) == [*names, "navigation-random-random_threshold=0.75-seed0"]
+    assert not runs[names[0]].config.parameters
+    assert runs[names[1]].config.parameters["random_threshold"] == 0.5
+
+
+def test_tuples_and_switches_come_in_lists_too():
+    runs = planned("navigation", "--hidden-sizes", "64", "32,16", "--normalize-observations", "on,off")
+    sizes = {run.config.hidden_sizes for run in runs.values()}
+    assert sizes == {(64, 32), (16,)}
+    assert next(iter(runs)) == "navigation-cur-hidden_sizes=64x32-normalize_observations=on-seed0"
+    assert [bool(run.config.normalize_observations) for run in runs.values()] == [True, False] * 2
+    (run,) = planned("navigation", "--hidden-sizes", "64", "32", "--no-normalize-observations").values()
+    assert (run.config.hidden_sizes, bool(run.config.normalize_observations)) == ((64, 32), False)
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+def test_a_file_is_the_same_as_flags_and_flags_override_it(tmp_path):
+    file = write(
+        tmp_path / "study.toml",
+        """
+        environment = ["navigation", "block_push"]
+        algorithm = ["cur", "random"]
+        seeds = 2
+        num_humans = 1
+        learning-rate = [1e-3, 1e-4]
+        random_threshold = [0.5]
+        hidden_sizes = [[8], [8, 4]]
+        log_interventions = true
+        """,
+    )
+    lists = ("--num-humans", 1, "--learning-rate", "1e-3,1e-4", "--random-threshold", 0.5, "--hidden-sizes", "8,8", 4)
+    typed = ("--algorithm", "cur,random", "--seeds", 2, *lists, "--log-interventions")
+    assert settings(planned(file)) == settings(planned("navigation", "block_push", *typed))
+    shorter = ("--algorithm", "cur", "--seed", 5, "--learning-rate", "1e-4", "--hidden-sizes", 16, 8)
+    assert settings(planned(file, "navigation", "--random-threshold", 0.5, *shorter, "--algorithm", "cur,random")) == settings(
+        planned(
+            "navigation",
+            "--random-threshold",
+            0.5,
+            "--num-humans",
+            1,
+            "--log-interventions",
+            *shorter,
+            "--algorithm",
+            "cur,random",
+        )
+    )
+
+
+def test_a_file_may_have_parts_with_the_top_as_their_defaults(tmp_path):
+    file = write(
+        tmp_path / "study.toml",
+        """
+        output = "elsewhere"
+        workers = 3
+        environment = "navigation"
+        num_robots = 20
+        seeds = 2
+        [[runs]]
+        algorithm = ["cur", "random"]
+        random_threshold = 0.5
+        [[runs]]
+        algorithm = "expert"
+        num_robots = 4
+        hidden_sizes = [8, 4]
+        seed = 9
+        """,
+    )
+    asked = study.make_study([str(file)], {})
+    assert (asked.output, asked.workers, asked.checkpoint_every) == (Path("elsewhere"), 3, 1000)
+    runs = planned(file)
+    assert list(runs) == [
+        "navigation-cur-num_robots=20-seed0",
+        "navigation-cur-num_robots=20-seed1",
+        "navigation-random-random_threshold=0.5-num_robots=20-seed0",
+        "navigation-random-random_threshold=0.5-num_robots=20-seed1",
+        "navigation-expert-num_robots=4-hidden_sizes=8x4-seed9",
+    ]
+    assert [run.config.num_robots for run in runs.values()] == [20, 20, 20, 20, 4]
+
+
+def test_the_study_of_the_documentation_is_one(tmp_path):
+    page = (Path(__file__).parents[1] / "docs" / "sweeps.md").read_text()
+    runs = planned(write(tmp_path / "study.toml", page.split("```toml\n")[1].split("```")[0]))
+    assert len(runs) == 2 * 5 * (2 * 2 + 1)
+
+
+NAV = "navigation"
+BAD = {
+    "M > N": (
+        (NAV, "--num-robots", "4,2", "--num-humans", 3),
+        "navigation, cur, num_robots 2: num_humans = 3 is more than num_robots",
+    ),
+    "no goal": (
+        ("humanoid", "--algorithm", "cur,thrifty_dagger"),
+        "humanoid, thrifty_dagger: algorithm = 'thrifty_dagger' needs",
+    ),
+    "environment": (("humanoit",), "humanoit, cur: environment = 'humanoit' is unknown; the closest are humanoid"),
+    "algorithm": ((NAV, "--algorithm", "cur,ensemble"), "algorithm = 'ensemble' is unknown; the closest are ensemble_dagger"),
+    "flag": ((NAV, "--num-robot", "4,5"), "unknown flag --num-robot; the closest is --num-robots"),
+    "nobody's": ((NAV, "--random-threshold", 0.5), "random_threshold is a parameter of algorithm = 'random'; omit it, or add"),
+    "twice": ((NAV, "--num-robots", "4,4"), "num_robots lists 4 twice; omit one"),
+    "environment twice": ((NAV, NAV), "environment lists 'navigation' twice; omit one"),
+    "seed twice": ((NAV, "--seed", "4,4"), "seed lists 4 twice; omit one"),
+    "same number": ((NAV, "--risk-threshold", "0.1,0.1000000001"), "is in the sweep twice; omit one"),
+    "empty": ((NAV, "--algorithm", ""), "--algorithm: '' has an empty entry"),
+    "empty entry": ((NAV, "--num-robots", "4,,5"), "--num-robots: '4,,5' has an empty entry"),
+    "empty tuple": ((NAV, "--hidden-sizes", "8,"), "--hidden-sizes: '8,' has an empty entry"),
+    "no number": ((NAV, "--num-robots", "4,many"), "--num-robots: 'many' must be a number"),
+    "no switch": ((NAV, "--normalize-observations", "yes"), "--normalize-observations: 'yes' must be on or off"),
+    "no seeds": ((NAV, "--seeds", 0), "seeds = 0 must be a whole number from 1"),
+    "both seeds": ((NAV, "--seeds", 2, "--seed", 4), "seed and seeds contradict each other"),
+    "workers": ((NAV, "--workers", 0), "workers = 0 must be at least 1"),
+    "checkpoints": ((NAV, "--checkpoint-every", 1), "checkpoint_every = 1 must be 0 (none) or at least 2"),
+    "memory": ((NAV, "--hidden-sizes", 8, "8,1000000000", 1000000000), "hidden_sizes = (1000000000, 1000000000) is too large"),
+    "files": (("a.toml", "b.toml"), "a.toml and b.toml are two files"),
+    "no file": (("nowhere.toml",), "nowhere.toml does not exist"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_sweeps_cost_one_line_and_touch_nothing(name, capsys, tmp_path):
+    arguments, reason = BAD[name]
+    assert reason in refused(capsys, "sweep", "--output", tmp_path / "out", *arguments)
+    assert not (tmp_path / "out").exists()
+
+
+BAD_FILES = {
+    "syntax": ("environment = [", "cannot be used: "),
+    "name": ("num_robot = 4", "parameter = 'num_robot' is unknown; the closest are num_robots"),
+    "empty": ("num_robots = []", "num_robots = [] is empty; give at least one value"),
+    "empty tuple": ("hidden_sizes = []", "hidden_sizes = [] is empty"),
+    "kind": ("num_robots = [40, 'five']", "navigation, cur, num_robots five: num_robots = 'five' must be"),
+    "table": ("num_robots = { low = 4 }", "num_robots = {'low': 4} must be"),
+    "seed": ("seed = [0, -1]", "seed = [0, -1] must hold whole numbers from 0"),
+    "seeds": ("seeds = [1, 2]", "seeds = [1, 2] must be a whole number"),
+    "option": ("workers = '2'", "workers = '2' must be of type int"),
+    "runs": ("runs = 4", "runs must be [[runs]] blocks"),
+    "part": ("[[runs]]\nalgoritm = 'cur'", "parameter = 'algoritm' is unknown; the closest are algorithm"),
+    "same parts": ("[[runs]]\nseeds = 2\n[[runs]]\nseed = 1", "navigation-cur-seed1 is in the sweep twice; omit one"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_bad_files_cost_one_line_and_touch_nothing(name, capsys, tmp_path):
+    content, reason = BAD_FILES[name]
+    file = write(tmp_path / "study.toml", f"environment = 'navigation'\n{content}")
+    assert reason in refused(capsys, "sweep", file, "--output", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_sweep_needs_an_environment_and_a_folder_of_its_own(capsys, tmp_path):
+    assert "ENV is missing" in refused(capsys, "sweep", "--output", tmp_path / "out")
+    assert "--output is missing; name a folder for the runs" in refused(capsys, "sweep", "navigation")
+    (tmp_path / "precious").touch()
+    assert "is not the folder of a sweep" in refused(capsys, "sweep", "navigation", "--output", tmp_path)
+    assert f"{tmp_path / 'precious'} exists already" in refused(
+        capsys, "sweep", "navigation", "--output", tmp_path / "precious"
+    )
+    (tmp_path / "out").mkdir()
+    for damaged in ("", "{}", "[]", '{"runs": [4], "log_interventions": false}'):
+        (tmp_path / "out" / sweep.FILE).write_text(damaged)
+        said = refused(capsys, "sweep", "navigation", "--output", tmp_path / "out")
+        assert f"{tmp_path / 'out' / sweep.FILE} cannot be used: " in said
+
+
+# Who does what
+
+
+def test_workers_keep_their_program_and_help_others_when_it_is_done():
+    runs = list(planned("navigation", "--algorithm", "cur,uc,c", "--risk-threshold", "0.1,0.2", "--seeds", 2).values())
+    by_algorithm = {name: [run for run in runs if run.config.algorithm == name] for name in ("cur", "uc", "c")}
+    cur, uc, c = (study.program(by_algorithm[name][0]) for name in by_algorithm)
+    assert {study.program(run) for run in by_algorithm["cur"]} == {cur}
+    assert len({cur, uc, c}) == 3
+    assert crew.choose(runs, None, []) == by_algorithm["cur"][0]
+    assert crew.choose(runs, None, [cur]) == by_algorithm["uc"][0]
+    assert crew.choose(runs, uc, [cur]) == by_algorithm["uc"][0]
+    assert crew.choose(by_algorithm["cur"] + by_algorithm["c"], uc, [cur]) == by_algorithm["c"][0]
+    assert crew.choose([*by_algorithm["c"][:1], *by_algorithm["cur"]], uc, [cur, c]) == by_algorithm["cur"][0]
+    assert crew.choose(by_algorithm["cur"][3:], uc, [cur]) == by_algorithm["cur"][3]
+
+
+# Other processes, which can be killed
+
+RANDOM = ("--algorithm", "random", "--random-threshold", "0.5", *TINY)
+
+
+@pytest.fixture(scope="module")
+def spawn(tmp_path_factory):
+    """A function that starts the command line in a process; compiled programs are kept, so that starts are quick."""
+    cache = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path_factory.mktemp("programs")), "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
+    cache |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0", "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "0"}
+
+    def spawn(*arguments: object) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "fleetjax", *map(str, arguments)]
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        return subprocess.Popen(command, env=os.environ | cache, text=True, start_new_session=True, **pipes)
+
+    return spawn
+
+
+def end(process: subprocess.Popen[str]) -> tuple[int, str, list[str]]:
+    """Return the exit code of a process, and what it printed: stdout, and the lines of stderr."""
+    out, err = process.communicate()
+    return process.returncode, out, err.splitlines()
+
+
+@pytest.fixture(scope="module")
+def compiled():
+    """A list of how long each program took to compile since it was cleared; compilation is as quick as `spawn`'s."""
+    seconds: list[float] = []
+
+    def count(event: str, duration: float, **_: object) -> None:
+        if event.endswith("backend_compile_duration"):
+            seconds.append(duration)
+
+    jax.monitoring.register_event_duration_secs_listener(count)
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield seconds
+    jax.config.update("jax_disable_most_optimizations", False)
+    jax.monitoring.unregister_event_duration_listener(count)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, compiled):
+    """Metrics and policies of plain runs, by seed; only the first compiles."""
+    path = tmp_path_factory.mktemp("plain")
+    for seed in range(3):
+        compiled.clear()
+        assert cli.main(["run", "navigation", *RANDOM, "--seed", str(seed), "--output", str(path / str(seed))]) == 0
+        assert (len(compiled) >= 2) == (seed == 0)
+    return {seed: results(path / str(seed)) for seed in range(3)}
+
+
+def results(path: Path) -> list[bytes]:
+    return [(path / name).read_bytes() for name in RESULTS]
+
+
+def the_run(output: Path, seed: int) -> Path:
+    return output / f"navigation-random-seed{seed}"
+
+
+def rows(path: Path) -> int:
+    return (path / "metrics.csv").read_bytes().count(b"\n") - 1 if (path / "metrics.csv").exists() else 0
+
+
+def wait_until(condition, process: subprocess.Popen[str]) -> None:
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        time.sleep(1e-3)
+
+
+def children(process: subprocess.Popen[str]) -> list[int]:
+    return list(map(int, Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()))
+
+
+def owner(path: Path) -> int:
+    """Return the process that works in a run folder."""
+    return int((path / ".lock").read_text())
+
+
+def is_alive(process: int) -> bool:
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def wait_for_end(processes: list[int]) -> None:
+    for _ in range(100_000):  # only not to hang: it takes a moment
+        if not any(map(is_alive, processes)):
+            return
+        time.sleep(1e-3)
+    raise AssertionError(f"{processes} still run")
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory, spawn):
+    """The folder of a finished sweep with two programs, and what was printed; whoever changes it takes a copy."""
+    output = tmp_path_factory.mktemp("sweeps") / "swept"
+    command = ("sweep", "navigation", *RANDOM, "--algorithm", "random,expert", "--seeds", 2, "--output", output)
+    code, out, said = end(spawn(*command, "--workers", 2))
+    assert code == 0, said
+    return output, command, out, said
+
+
+def test_a_sweep_gives_the_folders_that_plain_runs_give(swept, whole, capsys):
+    output, _, out, said = swept
+    names = [f"navigation-{algorithm}-seed{seed}" for algorithm in ("random", "expert") for seed in (0, 1)]
+    assert {path.name for path in output.iterdir()} == {*names, "sweep.json", "logs"}
+    assert {path.name for path in (output / "logs").iterdir()} == {f"{name}.log" for name in names}
+    assert said[0] == "4 runs, 0 of them finished already"
+    assert {line.split(": ")[-1] for line in said[1:]} == {f"{name} finished" for name in names}
+    assert said[-1].startswith("4 of 4 runs, 0.0 s left: ")
+    assert re.fullmatch(rf"4 runs finished, .+ in all\. Folder: {re.escape(str(output))}\n", out)
+    for seed in (0, 1):
+        assert results(the_run(output, seed)) == whole[seed]
+        assert set(contents(the_run(output, seed))) == {"config.json", "metrics.csv", "figure.png", "policy.msgpack"}
+    assert "100% " in (output / "logs" / f"{names[0]}.log").read_text()
+    assert cli.main(["plot", *(str(output / name) for name in names), "--output", str(output.parent / "all.svg")]) == 0
+    assert cli.main(["run", "--resume", str(output / names[0])]) == 0
+    assert "is already finished" in capsys.readouterr().err
+
+
+def test_runs_of_one_program_compile_nothing_new(whole, compiled, tmp_path):
+    compiled.clear()
+    runs = planned("navigation", *RANDOM, "--random-threshold", "0.5,0.6", "--learning-rate", "1e-3,1e-4", output=tmp_path)
+    for run in runs.values():
+        resumable.complete(run, checkpoint_every=200)
+    assert compiled == []
+    found = {name: results(run.folder) for name, run in runs.items()}
+    assert found["navigation-random-random_threshold=0.5-learning_rate=0.001-seed0"] == whole[0]
+    assert len({metrics for metrics, _ in found.values()}) == 4
+
+
+@pytest.fixture
+def copied(swept, tmp_path):
+    """A copy of the finished sweep, and the command that made it, for the copy."""
+    output, command, _, _ = swept
+    copy = Path(shutil.copytree(output, tmp_path / "copy"))
+    return copy, (*command[:-1], copy)
+
+
+def everything(path: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(path)): file.read_bytes() for file in path.rglob("*") if file.is_file()}
+
+
+def test_a_finished_sweep_starts_nothing_and_a_larger_one_only_what_is_new(copied, spawn, whole, capsys):
+    output, command = copied
+    before = everything(output)
+    assert cli.main([*map(str, command)]) == 0
+    assert capsys.readouterr().err == "4 runs, 4 of them finished already\n"
+    assert everything(output) == before
+    larger = command[: command.index("--seeds")]
+    code, _, said = end(spawn(*larger, "--algorithm", "expert,random", "--seeds", 3, "--output", output))
+    assert code == 0, said
+    assert said[0] == "6 runs, 4 of them finished already"
+    assert results(the_run(output, 2)) == whole[2]
+    after = everything(output)
+    assert {name for name in before if after[name] != before[name]} == {"sweep.json"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (("--num-steps", 300), "navigation-random-seed0: num_steps = 300, but the run has 3000 in "),
+        (("--random-threshold", 0.6), "navigation-random-seed0: random_threshold = 0.6, but the run has 0.5 in "),
+        (("--log-interventions",), "navigation-random-seed0: log_interventions = True, but the run has False in "),
+        (
+            ("--seeds", 1),
+            "holds another sweep, with a run navigation-random-seed1 that this one lacks; choose another --output",
+        ),
+        (("--min-teleop-time", "5,6"), "holds another sweep, with a run navigation-random-seed0 that this one lacks; choose"),
+    ],
+)
+def test_a_folder_with_another_sweep_is_refused(swept, capsys, arguments, reason):
+    output, command, *_ = swept
+    before = everything(output)
+    said = refused(capsys, *command, *arguments)
+    assert reason in said
+    assert "choose another --output" in said
+    assert everything(output) == before
+
+
+def test_a_run_that_fails_is_told_and_the_others_go_on(tmp_path, spawn, whole):
+    output = tmp_path / "out"
+    damaged = the_run(output, 0)
+    command = ("sweep", "navigation", *RANDOM, "--seeds", 3, "--workers", 2, "--output", output)
+    asked = study.make_study(["navigation"], vars(flags.parse([*map(str, command)])))
+    damaged.mkdir(parents=True)
+    (damaged / "config.json").write_text("{}")
+    (output / sweep.FILE).write_text(json.dumps({"runs": asked.blocks, "log_interventions": False}))
+    code, out, said = end(spawn(*command))
+    assert (code, out) == (1, "")
+    log = output / "logs" / f"{damaged.name}.log"
+    (told,) = [line for line in said if " failed: " in line]
+    assert f"{damaged.name} failed: {damaged / 'config.json'} cannot be used: it was not written by fleetjax" in told
+    assert told.endswith(f"; its log is {log}")
+    assert "ValueError" in log.read_text()
+    assert said[-1].startswith("fleetjax: 1 of 3 runs failed; repeat the command to try again")
+    assert [results(the_run(output, seed)) for seed in (1, 2)] == [whole[1], whole[2]]
+    shutil.rmtree(damaged)
+    code, _, said = end(spawn(*command))
+    assert (code, said[0]) == (0, "3 runs, 2 of them finished already")
+    assert results(damaged) == whole[0]
+
+
+def test_kills_of_workers_and_of_all_lose_nothing(tmp_path, spawn, whole):
+    output = tmp_path / "out"
+    command = ("sweep", "navigation", *RANDOM, "--seeds", 3, "--workers", 2, "--output", output)
+    process = spawn(*command)
+    with contextlib.ExitStack() as stack:
+        stack.callback(process.kill)
+        wait_until(lambda: rows(the_run(output, 0)) > 500 and the_run(output, 1).exists(), process)
+        workers = children(process)
+        assert {owner(the_run(output, 0)), owner(the_run(output, 1))} <= set(workers)
+        process.kill()
+        process.communicate()
+        wait_for_end(workers)
+        assert 500 < rows(the_run(output, 0)) < STEPS
+
+        process = spawn(*command)
+        stack.callback(process.kill)
+        wait_until(lambda: rows(the_run(output, 2)) > 500, process)
+        os.kill(owner(the_run(output, 2)), signal.SIGKILL)
+        code, _, said = end(process)
+    assert code == 1
+    (told,) = [line for line in said if " failed: " in line]
+    assert "navigation-random-seed2 failed: its worker ended (SIGKILL); its log is " in told
+    assert said[-1].startswith("fleetjax: 1 of 3 runs failed")
+
+    code, _, said = end(spawn(*command))
+    assert (code, said[0]) == (0, "3 runs, 2 of them finished already")
+    assert [results(the_run(output, seed)) for seed in range(3)] == [whole[seed] for seed in range(3)]
+    for seed in (0, 2):
+        assert "resuming from" in (output / "logs" / f"navigation-random-seed{seed}.log").read_text()
+
+
+@pytest.mark.parametrize(("number", "together"), [(signal.SIGINT, 2), (signal.SIGTERM, 1)])
+def test_a_stopped_sweep_writes_checkpoints_and_resumes(tmp_path, spawn, whole, number, together):
+    output = tmp_path / "out"
+    command = ("sweep", "navigation", *RANDOM, "--seeds", 3, "--workers", together, "--checkpoint-every", 0, "--output", output)
+    process = spawn(*command)
+    with contextlib.ExitStack() as stack:
+        stack.callback(process.kill)
+        wait_until(lambda: rows(the_run(output, 0)) > 300, process)
+        workers = children(process)
+        if number == signal.SIGINT:
+            os.killpg(process.pid, number)  # as a terminal does
+        else:
+            process.send_signal(number)
+        code, out, said = end(process)
+    assert (code, out) == (130, "")
+    assert re.fullmatch("fleetjax: interrupted with [0-2] of 3 runs finished; repeat the command to resume", said[-1])
+    assert not any(map(is_alive, workers))
+    assert the_run(output, 1).exists() == (together == 2)
+    assert 300 < rows(the_run(output, 0)) < STEPS
+    assert list(the_run(output, 0).glob("checkpoints/*/manifest.json"))
+    code, _, said = end(spawn(*command))
+    assert code == 0, said
+    assert [results(the_run(output, seed)) for seed in range(3)] == [whole[seed] for seed in range(3)]
+    assert "resuming from" in (output / "logs" / "navigation-random-seed0.log").read_text()

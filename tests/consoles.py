@@ -39,10 +39,10 @@ _compile = engine.compile_programs
 _compiled: dict[Any, engine.Programs] = {}
 
 
-def flags(**changes: Any) -> list[str]:
+def flags() -> list[str]:
     """Return the small fleet as flags of the command line."""
     words = []
-    for name, value in (SMALL | changes).items():
+    for name, value in SMALL.items():
         words += [f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, tuple) else [value])]
     return words
 

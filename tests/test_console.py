@@ -589,7 +589,8 @@ def test_an_older_run_stays_until_the_first_timestep(tmp_path, monkeypatch, port
     path.mkdir()
     older = {"config.json": b"{}", "metrics.csv": b"precious", "mine": b"mine"}
     restore(path, older)
-    console = ["console", "navigation", *flags(num_steps=1), "--port", "0", "--output", str(path), "--overwrite"]
+    given = ["--interval", "0.005", "--port", "0", "--output", str(path), "--overwrite"]
+    console = ["console", "navigation", *flags(), *given]
     stopper = threading.Thread(target=lambda: (port_of(), knock(port_of()), os.kill(os.getpid(), signal.SIGINT)))
     stopper.start()
     assert cli.main(console) == 130

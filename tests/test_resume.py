@@ -1,6 +1,7 @@
 """A run that is stopped, killed or damaged and then resumed gives the bits of one that was not."""
 
 import contextlib
+import io
 import json
 import os
 import re
@@ -60,17 +61,23 @@ def interrupt_after(chunks: int, *, times: int = 1):
     return progress
 
 
-@pytest.fixture
-def stopped(tmp_path, monkeypatch, whole, capsys):
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory):
     """A run with checkpoints at t = 30, 60 and 66, where Ctrl-C stopped it; the last two are kept."""
-    path = tmp_path / "stopped"
-    with monkeypatch.context() as patch:
+    path, said = tmp_path_factory.mktemp("runs") / "interrupted", io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stderr(said):
         patch.setattr(resumable, "progress", interrupt_after(33))
         assert run_here(*RUN, "--output", path, "--checkpoint-every", 30) == 130
     assert steps_of(path) == [60, 66]
-    line = capsys.readouterr().err.splitlines()[-1]
+    line = said.getvalue().splitlines()[-1]
     assert line == f"fleetjax: interrupted at t = 66 of {STEPS}; resume with: fleetjax run --resume {path}"
     return path
+
+
+@pytest.fixture
+def stopped(interrupted, tmp_path):
+    """A copy of the interrupted run."""
+    return Path(shutil.copytree(interrupted, tmp_path / "stopped"))
 
 
 def steps_of(path: Path) -> list[int]:

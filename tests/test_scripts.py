@@ -101,12 +101,6 @@ CASES = {
         (row("observation", "256", *[r"\d\.\d{4}"] * 3, r"\d+"), r"variance of the expert's actions \| +\| 0\.\d+"),
         quick=True,
     ),
-    "experiments/paper.py": Case(
-        ("tiny --studies . --workers 1 --output runs --results rows", "tiny --studies . --results rows --rows-only"),
-        (r"^rows/tiny\.md$", r"^rows/tiny\.png$"),
-        ("rows/tiny.csv", "rows/tiny.md", "rows/tiny.png", "runs/tiny/sweep.json"),
-        lambda place: (place / "tiny.toml").write_text(TINY_STUDY) and None,
-    ),
     "experiments/first_look.py": Case(
         (
             f"--environments navigation --algorithms random --seeds 0 1 --output looks -- {FLEET}",
@@ -120,6 +114,12 @@ CASES = {
         (r"^run-1: \d+ of 80 human timesteps, [\d.]+ %$", r"^mean \d+; .* random_threshold 0\.\d{5}$"),
         prepare=make_runs,
         quick=True,
+    ),
+    "experiments/paper.py": Case(
+        ("tiny --studies . --workers 1 --output runs --results rows", "tiny --studies . --results rows --rows-only"),
+        (r"^rows/tiny\.md$", r"^rows/tiny\.png$"),
+        ("rows/tiny.csv", "rows/tiny.md", "rows/tiny.png", "runs/tiny/sweep.json"),
+        lambda place: (place / "tiny.toml").write_text(TINY_STUDY) and None,
     ),
     "experiments/settle_cubes.py": Case(
         ("--number 4 --output settled.npz",), (r"^\d+ of \d+ cubes came to rest near the goal$",), ("settled.npz",), quick=True

@@ -230,13 +230,13 @@ def make_config(environment: "str | envs.Env", algorithm: str = "cur", **overrid
         if override not in known:
             raise ValueError(_not_known(override, algorithm))
     of_place = {key: value for key, value in defaults.items() if key in known}
-    spec = (env or envs.make(name, overrides.get("backend", "auto"))).spec
-    if spec.success_return is not None:
-        of_place["success_return"] = spec.success_return
     of_field = {key: field.default for key, field in known.items()}
     config = Config().replace(**of_field | of_place | {"environment": name, "algorithm": algorithm} | overrides)
-    of_algorithm = priority.get_algorithm(algorithm).defaults(config)
-    config = config.replace(**{**of_algorithm, **overrides})  # again: a human_capacity that is given must not grow unasked
+    of_others = dict(priority.get_algorithm(algorithm).defaults(config))
+    bar = (env or envs.make(name, config.backend)).spec.success_return
+    if bar is not None:
+        of_others["success_return"] = bar
+    config = config.replace(**{**of_others, **overrides})  # again: a human_capacity that is given must not grow unasked
     validate(config, env)
     return config
 

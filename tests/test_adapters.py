@@ -47,7 +47,9 @@ def start(pendulum):
 
 
 def test_brax_spec(pendulum):
-    assert pendulum.spec == envs.EnvSpec("brax/inverted_pendulum", 4, 1, HORIZON, pytest.approx(0.04), supervisor="balance")
+    assert pendulum.spec == envs.EnvSpec(
+        "brax/inverted_pendulum", 4, 1, HORIZON, pytest.approx(0.04), supervisor="balance", success_return=59.5
+    )
 
 
 def test_brax_episodes(balance, start, step):
@@ -153,7 +155,7 @@ def test_playground(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco_playground", playground)
     env = envs.from_playground("Slide", supervisor="balance", horizon=9, success_return=5.0, speed=0.25)
     assert made[0].config == {"impl": "jax", "speed": 0.25}
-    assert env.spec == envs.EnvSpec("playground/Slide", 2, 1, 9, 0.02, supervisor="balance")
+    assert env.spec == envs.EnvSpec("playground/Slide", 2, 1, 9, 0.02, supervisor="balance", success_return=5.0)
 
     def episode(key, push):
         step = lambda state, _: (env.step(state, push, True, key),) * 2  # noqa: E731

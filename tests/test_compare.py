@@ -264,7 +264,7 @@ def test_the_command_writes_what_is_asked_for(study, tmp_path, monkeypatch, caps
     assert content["a.csv"].decode() == expected.csv()
     assert content["a.png"][:4] == b"\x89PNG"
     assert b"mean of 5 seeds, band: 95 % interval" in content["a.svg"]
-    assert "a.md exists already" in refused(capsys, *command)
+    assert "a.md already exists" in refused(capsys, *command)
     assert cli.main([*command, "--overwrite"]) == 0
     assert cli.main(["compare", "rows.csv", "--metric", "idle", "--metric", "rohe", "--against", "cur"]) == 0
     again = capsys.readouterr().out.split("\n## ")[-1]

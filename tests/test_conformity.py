@@ -272,7 +272,8 @@ def test_algorithm_scores(name):
     """f32[N] >= 0; a memory of fixed structure; whoever is helped has a score; jit or not; thresholds do not recompile."""
     settings = settings_of(name)
     aux = priority.get_algorithm(name).make_priority(settings).init()
-    traced = ("uncertainty_threshold", "risk_threshold", *settings.parameters)
+    own = [field for field, value in settings.parameters.items() if jnp.issubdtype(value.dtype, jnp.floating)]
+    traced = ("uncertainty_threshold", "risk_threshold", *own)
     halved = settings.replace(**{field: get_value(settings, field) / 2 for field in traced})
     helped = 0
     for i, config in enumerate((settings, settings.replace(initial_period=20), halved)):

@@ -84,7 +84,7 @@ def test_parameters_are_traced_checked_swept_and_the_algorithms_alone(capsys):
     config = fleetjax.make_config("navigation", "weighing", **SMALL, weight=0.0)
     assert config.parameters["weight"].dtype == jnp.float32
     assert float(fleetjax.make_config("navigation", "weighing").parameters["weight"]) == 0.5
-    assert config.replace(algorithm="uc").parameters == {}
+    assert "weight" not in config.replace(algorithm="uc").parameters
     with pytest.raises(ValueError, match=r"weight = 3\.0 must be in \[0, 2\]"):
         fleetjax.make_config("navigation", "weighing", weight=3)
     elsewhere = "weight is a parameter of algorithm = 'weighing', not of 'uc'"
@@ -94,7 +94,7 @@ def test_parameters_are_traced_checked_swept_and_the_algorithms_alone(capsys):
         fleetjax.make_config("navigation", "uc").replace(weight=0.1)
     assert "weight is a parameter of" in refused(capsys, "run", "navigation", "--weight", "0.1")
     assert cli.main(["list"]) == 0
-    assert "weighing's own parameter: weight 0.5" in capsys.readouterr().out
+    assert "own parameter of weighing: weight 0.5" in capsys.readouterr().out
     assert plain.to_plain(config)["weight"] == 0.0
 
     program = compiled(lambda config: fleetjax.run(config, KEY).metrics.human_steps.sum())

@@ -28,7 +28,7 @@ def check_folder(study: Study, runs: Sequence[folder.Run]) -> None:
     path = study.output
     if not (path / FILE).exists():
         free = not os.path.lexists(path) or (path.is_dir() and {found.name for found in path.iterdir()} <= {files.LOCK})
-        files.expect(free, f"{path} exists already and is not the folder of a sweep; choose another --output")
+        files.expect(free, f"{path} already exists and is not the folder of a sweep; choose another --output")
         return
     here = {run.folder: run for run in runs}
     for run in _read(study):

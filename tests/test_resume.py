@@ -487,7 +487,7 @@ def test_a_policy_that_diverges_ends_the_run_and_says_when(stopped, capsys):
     writer.wait()
     assert run_here("run", "--resume", stopped) == 1
     line = capsys.readouterr().err.splitlines()[-1]
-    assert line.startswith("fleetjax: the policy has NaN or infinite numbers from t = 66 on")
+    assert line.startswith("fleetjax: the policy and the safety critic have NaN or infinite numbers from t = 66 on; try")
     assert f"The metrics so far are in {stopped}" in line
     assert len(folder.read_metrics(folder.read_run(stopped)).successes) == 68
     assert steps_of(stopped) == [60, 66]

@@ -10,7 +10,19 @@ import pytest
 QUICK_FLAGS = "--xla_cpu_use_fusion_emitters=false"
 
 # Files that take longest. They begin first, so that the workers end at about the same time.
-LONGEST = ("scripts", "physics", "learning", "resume", "console", "fuzz", "containment", "console_web", "whole_loop", "faults")
+LONGEST = (
+    "sweep",
+    "scripts",
+    "physics",
+    "learning",
+    "resume",
+    "console",
+    "fuzz",
+    "containment",
+    "console_web",
+    "whole_loop",
+    "faults",
+)
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in what a shell runs in the background; tests interrupt runs
     signal.signal(signal.SIGINT, signal.default_int_handler)

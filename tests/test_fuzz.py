@@ -236,6 +236,7 @@ def test_any_value_in_a_configuration_is_read_as_it_is_or_refused(finished, tmp_
     assert read == value or math.isclose(read, value, rel_tol=1e-6, abs_tol=1e-37)
 
 
+@pytest.mark.slow
 @FEW
 @hypothesis.given(
     name=st.sampled_from([*OF_A_RUN, "config.json"]), place=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7)

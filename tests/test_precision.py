@@ -49,6 +49,7 @@ def test_a_run_in_64_bits_is_that_in_32():
     assert narrow[0].teleop_steps.sum() > 0
 
 
+@pytest.mark.slow
 def test_robots_and_derivatives_trace_in_64_bits():
     """Every environment, both ways to run, and reverse mode."""
     with jax.enable_x64(True):

@@ -394,6 +394,7 @@ def everything(path: Path) -> dict[str, bytes]:
     return {str(file.relative_to(path)): file.read_bytes() for file in path.rglob("*") if file.is_file()}
 
 
+@pytest.mark.slow
 def test_a_finished_sweep_starts_nothing_and_a_larger_one_only_what_is_new(copied, spawn, whole, capsys):
     output, command = copied
     before = everything(output)
@@ -431,6 +432,7 @@ def test_a_folder_with_another_sweep_is_refused(swept, capsys, arguments, reason
     assert everything(output) == before
 
 
+@pytest.mark.slow
 def test_a_run_that_fails_is_told_and_the_others_go_on(tmp_path, spawn, whole):
     output = tmp_path / "out"
     damaged = the_run(output, 0)
@@ -454,6 +456,7 @@ def test_a_run_that_fails_is_told_and_the_others_go_on(tmp_path, spawn, whole):
     assert results(damaged) == whole[0]
 
 
+@pytest.mark.slow
 def test_kills_of_workers_and_of_all_lose_nothing(tmp_path, spawn, whole):
     output = tmp_path / "out"
     command = ("sweep", "navigation", *RANDOM, "--seeds", 3, "--workers", 2, "--output", output)
@@ -485,6 +488,7 @@ def test_kills_of_workers_and_of_all_lose_nothing(tmp_path, spawn, whole):
         assert "resuming from" in (output / "logs" / f"navigation-random-seed{seed}.log").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "together"), [(signal.SIGINT, 2), (signal.SIGTERM, 1)])
 def test_a_stopped_sweep_writes_checkpoints_and_resumes(tmp_path, spawn, whole, number, together):
     output = tmp_path / "out"

@@ -15,14 +15,15 @@ import jax
 import jax.numpy as jnp
 
 import fleetjax
-from fleetjax import tree
 from fleetjax.config import Config
 from fleetjax.envs import Env, allegro_hand
 from fleetjax.fleet import Parts, make_parts
 from fleetjax.learning import imitation, pretraining
 from fleetjax.supervisors import Supervisor
+from fleetjax.supervisors.expert import run_episodes
 from fleetjax.types import EnvState
 
+NUM_EPISODES = 100
 ROBOTS = ("humanoid", "anymal", "allegro_hand")
 VIEWS: dict[str, dict[str, Callable[[jax.Array], jax.Array]]] = {"allegro_hand": {"expert's view": allegro_hand.view}}
 
@@ -43,26 +44,6 @@ def seen_through(env: Env, view: Callable[[jax.Array], jax.Array]) -> Env:
     )
 
 
-def count_successes(parts: Parts, policy: imitation.PolicyState, key: jax.Array) -> jax.Array:
-    """Return the successes i32[] of 100 robots, each in one episode under a policy alone."""
-    env, num_robots = parts.env, 100
-    key_reset, key_steps = jax.random.split(key)
-    start = jax.vmap(env.reset)(jax.random.split(key_reset, num_robots), jnp.arange(num_robots))
-
-    def step(carry: tuple[EnvState, jax.Array], key: jax.Array) -> tuple[tuple[EnvState, jax.Array], jax.Array]:
-        state, active = carry
-        keys = jax.random.split(key, (2, num_robots))
-        after = jax.vmap(env.step)(state, parts.learner.predict(policy, state.obs)[0], active, keys[0])
-        succeeded = active & after.success
-        active &= ~(after.violation | after.timeout)
-        if env.next_goal:
-            after = tree.where(succeeded, jax.vmap(env.next_goal)(after, keys[1]), after)
-        return (tree.where(active, after, state), active), jnp.sum(succeeded)
-
-    keys = jax.random.split(key_steps, env.spec.horizon)
-    return jnp.sum(jax.lax.scan(step, (start, jnp.ones(num_robots, bool)), keys)[1])
-
-
 def compare(name: str, default: Config, parts: Parts, args: argparse.Namespace) -> None:
     """Print a row for each number of demonstrations, then what to compare with."""
 
@@ -77,7 +58,11 @@ def compare(name: str, default: Config, parts: Parts, args: argparse.Namespace) 
         valid = jnp.arange(error.size) < size
         return jnp.mean(error, where=valid), jnp.mean(uncertainty, where=valid)
 
-    achieve = jax.jit(lambda policy, key: count_successes(parts, policy, key))
+    @jax.jit
+    def count_successes(policy: imitation.PolicyState, key: jax.Array) -> jax.Array:
+        act, measure = lambda obs: parts.learner.predict(policy, obs)[0], lambda state: state.success.astype(jnp.float32)
+        return jnp.sum(run_episodes(parts.env, act, measure, num_episodes=NUM_EPISODES, key=key)[2])
+
     key_fresh, key_run, key = jax.random.split(jax.random.key(args.seed), 3)
     _, fresh = clone(default.replace(num_demonstrations=args.fresh, pretraining_steps=0), key_fresh)
     for number in args.demonstrations:
@@ -85,7 +70,7 @@ def compare(name: str, default: Config, parts: Parts, args: argparse.Namespace) 
         seen, _ = judge(policy, data.pairs.rows, data.pairs.size)
         error, uncertainty = judge(policy, fresh.pairs.rows, fresh.pairs.size)
         row = f"| {name} | {number:,} | {seen:.4f} | {error:.4f} | {uncertainty:.4f} |"
-        print(f"{row} {int(achieve(policy, key_run)):,} |", flush=True)
+        print(f"{row} {int(count_successes(policy, key_run)):,} |", flush=True)
     action = fresh.pairs.rows.action[: args.fresh]
     print(f"| {name} | variance of the expert's actions | | {jnp.mean(jnp.var(action, axis=0)):.4f} | | |", flush=True)
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleetjax.config import Config, all_fields, get_value, validate
+from fleetjax.config import Config, all_fields, get_value
 from fleetjax.io import files, folder, resumable, text
 from fleetjax.io.progress import say
 from fleetjax.search import Scale, solve
@@ -82,7 +82,6 @@ def check(request: Request) -> None:
             raise ValueError(f"{name} = {getattr(request, name)} must be at least {low}")
     if not request.seeds:
         raise ValueError("seeds must name one or more")
-    validate(request.config)
 
 
 def calibrate(request: Request) -> Calibration:
@@ -107,8 +106,7 @@ def calibrate(request: Request) -> Calibration:
         again = _over_seeds(request, moved, others, tried)
         if abs(np.mean(again) - request.human_time) < abs(np.mean(spent) - request.human_time):
             value, spent = moved, again
-    solved = bool(abs(np.mean(spent) - request.human_time) <= request.tolerance * request.human_time)
-    found = Calibration(value, spent, _error(value, spent, tried, scale), solved, tried)
+    found = Calibration(value, spent, _error(value, spent, tried, scale), _is_near(request, spent), tried)
     content = found._asdict() | {"field": request.field, "wanted": request.human_time, "seeds": request.seeds}
     files.write_json(request.output / FILE, content | {"versions": folder.versions()})
     return found
@@ -119,14 +117,19 @@ def _human_time(request: Request, value: float, seed: int) -> float:
     value = float(np.float32(value))
     path = request.output / f"{request.field}-{value:.6g}-seed{seed}"
     run = folder.Run(path, request.config.replace(**{request.field: value}), seed)
-    resumable.complete(run, checkpoint_every=request.checkpoint_every)
-    spent = float(np.sum(folder.read_metrics(folder.read_run(path)).human_steps, dtype=float))
+    metrics = resumable.complete(run, checkpoint_every=request.checkpoint_every)
+    spent = float(np.sum(metrics.human_steps, dtype=float))
     say(f"{request.field} = {value:.6g}, seed {seed}: {text.count(spent)} human timesteps")
     return spent
 
 
 def _over_seeds(request: Request, value: float, others: list[int], tried: list[tuple[float, float]]) -> tuple[float, ...]:
     return (dict(tried)[value], *(_human_time(request, value, seed) for seed in others))
+
+
+def _is_near(request: Request, spent: tuple[float, ...]) -> bool:
+    """Return whether the mean over seeds is what was wanted."""
+    return bool(abs(np.mean(spent) - request.human_time) <= request.tolerance * request.human_time)
 
 
 def _slope(value: float, tried: list[tuple[float, float]], scale: Scale) -> float:
@@ -143,10 +146,10 @@ def _corrected(
     request: Request, value: float, spent: tuple[float, ...], tried: list[tuple[float, float]], scale: Scale
 ) -> float | None:
     """Return the value at which the mean over seeds should be what is wanted; None if it is, or the slope does not tell."""
-    mean, slope = float(np.mean(spent)), _slope(value, tried, scale)
-    if abs(mean - request.human_time) <= request.tolerance * request.human_time or not abs(slope) > 1e-3:
+    slope = _slope(value, tried, scale)
+    if _is_near(request, spent) or not abs(slope) > 1e-3:
         return None
-    change = (math.log1p(request.human_time) - math.log1p(mean)) / slope
+    change = (math.log1p(request.human_time) - math.log1p(float(np.mean(spent)))) / slope
     return scale.outward(scale.inward(value) + min(max(change, -1.0), 1.0))
 
 

@@ -17,7 +17,7 @@ from fleetjax.io.lists import listed, sizes
 from fleetjax.registry import unknown
 from fleetjax.version import VERSION
 
-_LARGEST_SEED = 2**32 - 1  # JAX folds larger ones onto these
+LARGEST_SEED = 2**32 - 1  # JAX folds larger ones onto these
 _LARGEST = 2**31 - 1
 _RUNS = "run folder, folder that holds run folders, or file that `fleetjax compare --rows` wrote"
 PORT = 8765  # that a console serves
@@ -378,8 +378,8 @@ def _switch(text: str) -> bool:
 
 
 def _seed(text: str) -> int:
-    if not text.isascii() or not text.isdecimal() or int(text) > _LARGEST_SEED:
-        raise argparse.ArgumentTypeError(f"{text!r} must be a whole number from 0 to {_LARGEST_SEED}")
+    if not text.isascii() or not text.isdecimal() or int(text) > LARGEST_SEED:
+        raise argparse.ArgumentTypeError(f"{text!r} must be a whole number from 0 to {LARGEST_SEED}")
     return int(text)
 
 

@@ -50,12 +50,15 @@ def check_interval(checkpoint_every: int) -> None:
         raise ValueError(f"checkpoint_every = {checkpoint_every} must be 0 (none) or at least 2 timesteps")
 
 
-def complete(run: folder.Run, *, checkpoint_every: int) -> None:
+def complete(run: folder.Run, *, checkpoint_every: int) -> Metrics:
     """Run what is left of a run, whatever its folder holds of it: nothing yet, a part, or all.
 
     Args:
         run: its folder and its configuration, and whether interventions are logged.
         checkpoint_every: timesteps between checkpoints; 0 = none.
+
+    Returns:
+        Metrics[T] in numpy arrays.
 
     Raises:
         ValueError: if the folder holds another run, or a damaged one.
@@ -70,11 +73,12 @@ def complete(run: folder.Run, *, checkpoint_every: int) -> None:
             difference = folder.first_difference(asked, run)
             if difference:
                 raise ValueError(f"{difference} in {run.folder}; choose another --output")
-            if folder.read_finished(run):
-                return
+            finished = folder.read_finished(run)
+            if finished:
+                return finished
         else:
             folder.check_folder(run.folder, overwrite=False)
-        run_in_folder(run, resume=begun, checkpoint_every=checkpoint_every)
+        return run_in_folder(run, resume=begun, checkpoint_every=checkpoint_every)
 
 
 def run_in_folder(run: folder.Run, *, resume: bool, checkpoint_every: int) -> Metrics:

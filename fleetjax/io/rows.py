@@ -42,12 +42,13 @@ def write(runs: Sequence[Outcome]) -> bytes:
 
 
 def _row(run: Outcome) -> dict[str, Any]:
-    own, totals = {name: to_plain(run.config)[name] for name in _OWN}, text.add_up(run.metrics)
+    fields, totals = to_plain(run.config), text.add_up(run.metrics)
+    own = {name: fields[name] for name in _OWN}
     kept = thinned(len(run.timesteps))
     curves = {name: np.cumsum(getattr(run.metrics, name), dtype=np.int64)[kept].tolist() for name in CURVES}
     return {
         **own,
-        "config": _compact(_differing(run.config, own)),
+        "config": _compact(_differing(run.config, fields, own)),
         **(run.versions or folder.versions()),
         "processor": run.processor or processor(),
         "seed": run.seed,
@@ -61,11 +62,11 @@ def _compact(content: Mapping[str, Any]) -> str:
     return json.dumps(content, separators=(",", ":"))
 
 
-def _differing(config: Config, own: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields that differ from the defaults of a run's environment and algorithm."""
+def _differing(config: Config, fields: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """Return those `fields` of a configuration that differ from the defaults of a run's environment and algorithm."""
     default = to_plain(make_config(**own))
     derived = () if config.capacity_given else ("human_capacity",)
-    return {name: value for name, value in to_plain(config).items() if value != default[name] and name not in derived}
+    return {name: value for name, value in fields.items() if value != default[name] and name not in derived}
 
 
 def processor() -> str:

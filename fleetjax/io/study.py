@@ -20,10 +20,10 @@ from fleetjax.envs import list_envs
 from fleetjax.field import every_field, owners
 from fleetjax.io import folder, plain
 from fleetjax.io.files import expect
+from fleetjax.io.flags import LARGEST_SEED
 from fleetjax.registry import unknown
 
 Block = Mapping[str, list[Any]]
-_LARGEST_SEED = 2**32 - 1
 _MOST_SEEDS = 100_000
 _OPTIONS: Mapping[str, type] = {"output": str, "workers": int, "checkpoint_every": int, "log_interventions": bool}
 _SUFFIX = ".toml"
@@ -127,8 +127,8 @@ def _block(values: Mapping[str, Any]) -> Block:
         lists["seed"] = list(range(number))
     if "seed" in values:
         lists["seed"] = values["seed"] if isinstance(values["seed"], list) else [values["seed"]]
-        sound = all(type(seed) is int and 0 <= seed <= _LARGEST_SEED for seed in lists["seed"])
-        expect(sound, f"seed = {values['seed']!r} must hold whole numbers from 0 to {_LARGEST_SEED}")
+        sound = all(type(seed) is int and 0 <= seed <= LARGEST_SEED for seed in lists["seed"])
+        expect(sound, f"seed = {values['seed']!r} must hold whole numbers from 0 to {LARGEST_SEED}")
     for name, found in lists.items():
         expect(bool(found), f"{name} = [] is empty; give at least one value")
         twice = next((value for i, value in enumerate(found) if value in found[:i]), None)

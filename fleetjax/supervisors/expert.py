@@ -56,7 +56,7 @@ def score(
     key: jax.Array,
     view: View = everything,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Run one episode per robot under a policy.
+    """Run one episode per robot under an expert, as `run_episodes` does.
 
     Args:
         env: the environment.
@@ -65,6 +65,26 @@ def score(
         num_episodes: robots that run side by side.
         key: random key.
         view: what the policy sees of an observation.
+    """
+    return run_episodes(env, lambda obs: policy(weights, obs, view), measure, num_episodes=num_episodes, key=key)
+
+
+def run_episodes(
+    env: Env,
+    act: Callable[[jax.Array], jax.Array],
+    measure: Callable[[EnvState], jax.Array],
+    *,
+    num_episodes: int,
+    key: jax.Array,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Run one episode per robot under a policy.
+
+    Args:
+        env: the environment.
+        act: `obs f32[num_episodes, O] -> action f32[num_episodes, A]`.
+        measure: `EnvState -> f32[]`, what to add up over an episode's steps.
+        num_episodes: robots that run side by side.
+        key: random key.
 
     Returns:
         f32[num_episodes] undiscounted returns, i32[num_episodes] control steps before violation or horizon,
@@ -77,7 +97,7 @@ def score(
         state, total = carry
         key_env, key_goal = jax.random.split(key)
         active = ~state.violation
-        after = jax.vmap(env.step)(state, policy(weights, state.obs, view), active, jax.random.split(key_env, num_episodes))
+        after = jax.vmap(env.step)(state, act(state.obs), active, jax.random.split(key_env, num_episodes))
         total += jnp.where(active, jax.vmap(measure)(after), 0.0)
         if env.next_goal:
             after = tree.where(after.success, jax.vmap(env.next_goal)(after, jax.random.split(key_goal, num_episodes)), after)

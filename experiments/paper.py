@@ -3,55 +3,133 @@
     python experiments/paper.py [PART ...] [--seeds 5] [--workers 2] [--output runs/paper]
     python experiments/paper.py [PART ...] --rows-only       # tables and figures from the rows that are stored; no simulation
 
-A part is a file of `experiments/studies/`. Its runs go to a folder each below --output, its rows to
-`experiments/results/PART.csv`, and its tables and figure beside them. Repeat the command to resume: finished runs are skipped.
+A part is a file of `experiments/studies/`, and `policies`: the trained policies of the part `main` on their own, for as many
+timesteps as they were trained, without teleoperation.
+
+Runs go to a folder each below --output, their rows to `experiments/results/PART.csv`, and tables and a figure beside them. Repeat the
+command to resume: runs that have a row in one of these files, and finished runs, are not run again.
 """
 
 import argparse
-import sys
+from collections.abc import Iterable
 from pathlib import Path
 
-from fleetjax import cli
+import jax
+
+from fleetjax import compare, evaluate, plot
+from fleetjax.io import comparing, figure, files, folder, rows, sweep
+from fleetjax.io.outcomes import Outcome, group
+from fleetjax.io.sources import collect
+from fleetjax.io.study import Study, make_study, plan
+from fleetjax.priority import get_algorithm
 
 HERE = Path(__file__).parent
+PARTS = ("main", "gradient_steps", "policies", "ablations", "humans", "times", "equal_budget")  # in this order
+TRAINED = "main"  # the part whose policies are evaluated
+METRICS = {
+    "main": ("successes", "violations", "idle", "rohe", "rohe_with_demonstrations"),
+    "policies": ("successes", "violations", "idle"),
+}  # that are compared; those of `fleetjax compare` in other parts
 
 
-def fleetjax(*words: object) -> None:
-    """Run a command of fleetjax.
+def name_of(run: folder.Run | Outcome) -> str:
+    """Return what tells a run from others."""
+    return repr(folder.identity(run.config, run.seed))
 
-    Raises:
-        SystemExit: if it fails.
+
+def is_finished(run: folder.Run) -> bool:
+    """Return whether the folder of a run holds all its timesteps."""
+    return folder.is_run(run.folder) and folder.read_finished(folder.read_run(run.folder)) is not None
+
+
+class Part:
+    """A part of the study: its file, the folder of its runs, and its stored rows.
+
+    Args:
+        name: of the part.
+        args: the script's arguments.
     """
-    code = cli.main([str(word) for word in words])
-    if code:
-        sys.exit(code)
+
+    def __init__(self, name: str, args: argparse.Namespace):
+        self.name, self.args, self.path = name, args, args.results / f"{name}{rows.SUFFIX}"
+
+    def study(self) -> Study:
+        """Return its runs as a sweep."""
+        given = {"seeds": self.args.seeds, "workers": self.args.workers, "output": str(self.args.output / self.name)}
+        return make_study([str(self.args.studies / f"{self.name}.toml")], {k: v for k, v in given.items() if v is not None})
+
+    def rows(self) -> dict[str, Outcome]:
+        """Return its stored runs."""
+        return {name_of(run): run for run in rows.read(self.path)} if self.path.exists() else {}
+
+    def store(self, runs: Iterable[Outcome]) -> None:
+        """Store runs in place of those that are stored."""
+        if found := list(runs):
+            files.write(self.path, rows.write(found))
+
+    def run(self) -> None:
+        """Complete the runs, and store the rows of those that finished, even if others fail or it is interrupted."""
+        study, own = self.study(), self.rows()
+        runs = plan(study)
+        known = own | {name: run for other in PARTS if other != "policies" for name, run in Part(other, self.args).rows().items()}
+        missing = [run for run in runs if name_of(run) not in known]
+        sweep.check_folder(study, runs)
+        try:
+            if missing:
+                sweep.run_all(study, missing)
+        finally:
+            known |= {name_of(run): collect(run.folder)[0] for run in missing if is_finished(run)}
+            wanted = dict.fromkeys([*map(name_of, runs), *own])
+            self.store(known[name] for name in wanted if name in known)
+
+    def evaluate(self, trained: "Part") -> None:
+        """Run the trained policies of another part, each with the seed after its own. Expert's run stands for itself."""
+        known = self.rows()
+        missing = [run for run in plan(trained.study()) if name_of(run) not in known]
+        here = [run for run in missing if is_finished(run)]
+        print(f"{len(here)} policies to evaluate; {len(missing) - len(here)} have no finished run folder here")
+        for run in here:
+            found = collect(run.folder)[0]
+            if get_algorithm(run.config.algorithm).pretrains:
+                policy, key = folder.read_policy(folder.read_run(run.folder)), jax.random.key(run.seed + 1)
+                found = found._replace(metrics=jax.device_get(jax.jit(evaluate)(run.config, key, policy).metrics))
+            known[name_of(run)] = found
+            self.store(known.values())
+            print(f"{run.folder.name}: {found.metrics.successes.sum():,} successes", flush=True)
+
+    def show(self) -> None:
+        """Write tables and a figure of the stored rows."""
+        runs = list(self.rows().values())
+        if not runs:
+            return
+        places = [one.config.environment for one in group(runs) if one.config.algorithm == "cur"]
+        against = "cur" if places and len(set(places)) == len(places) else None  # where there is one C.U.R. to compare with
+        table = compare(runs, against, METRICS.get(self.name, comparing.METRICS), allow_different=True)
+        shown = [run for run in runs if run.config.algorithm != "expert"] or runs  # whose curves would flatten the others
+        for suffix, content in {".md": table.markdown().encode(), ".png": figure.render(plot(shown))}.items():
+            files.write(self.path.with_suffix(suffix), content)
+            print(self.path.with_suffix(suffix))
 
 
 def main() -> None:
     """Run the parts that are asked for, then show what they gave."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", metavar="PART", help="all if none is given")
-    parser.add_argument("--studies", type=Path, default=HERE / "studies", help="folder of the parts, a .toml file each")
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"out of {', '.join(PARTS)} [default: all]")
+    parser.add_argument("--studies", type=Path, default=HERE / "studies", help="folder of the parts' files")
     parser.add_argument("--seeds", type=int, help="in place of those in the file")
     parser.add_argument("--workers", type=int, help="processes [default: one for each core]")
     parser.add_argument("--output", type=Path, default=Path("runs/paper"), help="folder for the run folders")
     parser.add_argument("--results", type=Path, default=HERE / "results", help="folder for rows, tables and figures")
     parser.add_argument("--rows-only", action="store_true", help="do not run anything")
     args = parser.parse_args()
-    known = sorted(path.stem for path in args.studies.glob("*.toml"))
-    unknown = set(args.parts) - set(known)
-    if unknown:
-        parser.error(f"{', '.join(sorted(unknown))}: choose out of {', '.join(known)}")
+    for name in args.parts:
+        if name not in PARTS:
+            parser.error(f"{name}: choose out of {', '.join(PARTS)}")
     args.results.mkdir(parents=True, exist_ok=True)
-    for part in args.parts or known:
-        rows = args.results / f"{part}.csv"
+    for part in [Part(name, args) for name in args.parts or PARTS]:
         if not args.rows_only:
-            given = {"--seeds": args.seeds, "--workers": args.workers}
-            options = [word for flag, value in given.items() if value is not None for word in (flag, value)]
-            fleetjax("sweep", args.studies / f"{part}.toml", "--output", args.output / part, *options)
-            fleetjax("compare", args.output / part, "--allow-different", "--rows", rows, "--overwrite")
-        outputs = [word for suffix in ("md", "png") for word in ("--output", args.results / f"{part}.{suffix}")]
-        fleetjax("compare", rows, "--allow-different", *outputs, "--overwrite")
+            part.evaluate(Part(TRAINED, args)) if part.name == "policies" else part.run()
+        part.show()
 
 
 if __name__ == "__main__":

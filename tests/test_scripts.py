@@ -116,10 +116,20 @@ CASES = {
         quick=True,
     ),
     "experiments/paper.py": Case(
-        ("tiny --studies . --workers 1 --output runs --results rows", "tiny --studies . --results rows --rows-only"),
-        (r"^rows/tiny\.md$", r"^rows/tiny\.png$"),
-        ("rows/tiny.csv", "rows/tiny.md", "rows/tiny.png", "runs/tiny/sweep.json"),
-        lambda place: (place / "tiny.toml").write_text(TINY_STUDY) and None,
+        (
+            "main policies --studies . --workers 1 --output runs --results rows",
+            "main policies --studies . --output elsewhere --results rows",
+            "main policies --studies . --results rows --rows-only",
+        ),
+        (
+            r"^2 runs finished",
+            r"^2 policies to evaluate; 0 have no finished run folder here$",
+            r"^navigation-constraint-seed0: \d+ successes$",
+            r"^0 policies to evaluate; 0 have",
+            r"^rows/policies\.md$",
+        ),
+        ("rows/main.csv", "rows/main.md", "rows/main.png", "rows/policies.csv", "runs/main/sweep.json"),
+        lambda place: (place / "main.toml").write_text(TINY_STUDY) and None,
     ),
     "experiments/settle_cubes.py": Case(
         ("--number 4 --output settled.npz",), (r"^\d+ of \d+ cubes came to rest near the goal$",), ("settled.npz",), quick=True

@@ -6,8 +6,8 @@
 A part is a file of `experiments/studies/`, and `policies`: the trained policies of the part `main` on their own, for as many
 timesteps as they were trained, without teleoperation.
 
-Runs go to a folder each below --output, their rows to `experiments/results/PART.csv`, and tables and a figure beside them. Repeat the
-command to resume: runs that have a row in one of these files, and finished runs, are not run again.
+Runs go to a folder each below --output, their rows to `experiments/results/PART.csv`, and tables and a figure beside them.
+Repeat the command to resume: runs that have a row in one of these files, and finished runs, are not run again.
 """
 
 import argparse
@@ -71,7 +71,9 @@ class Part:
         """Complete the runs, and store the rows of those that finished, even if others fail or it is interrupted."""
         study, own = self.study(), self.rows()
         runs = plan(study)
-        known = own | {name: run for other in PARTS if other != "policies" for name, run in Part(other, self.args).rows().items()}
+        known = own | {
+            name: run for other in PARTS if other != "policies" for name, run in Part(other, self.args).rows().items()
+        }
         missing = [run for run in runs if name_of(run) not in known]
         sweep.check_folder(study, runs)
         try:

@@ -118,7 +118,7 @@ CASES = {
         (
             row("Humanoid: C.U.R. has the most successes", "holds", r"C.U.R. - \w+", "400, 400 to 400", "5"),
             row("Humanoid: C.U.R. has the fewest violations", "does not hold", "Constraint - C.U.R.", "-80, -80 to -80", "5"),
-            row("the return of C.U.R. is up to 8.8 times a baseline's", r"\w+", r"C.U.R. - 8.8 x \w+"),
+            row("the return of C.U.R. is up to 8.8 times a baseline's", r"[\w ]+", r"C.U.R. - 8.8 x \w+"),
             row("ANYmal: C.U.R. has the most successes", "not run yet", "", "", ""),
         ),
         ("claims.md",),

@@ -88,3 +88,42 @@ def helper_of(humans: HumanState, num_robots: int) -> jax.Array:
     num_humans = humans.robot.shape[0]
     place = jnp.where(humans.robot >= 0, humans.robot, num_robots)
     return jnp.full(num_robots, -1, jnp.int32).at[place].set(jnp.arange(num_humans, dtype=jnp.int32), mode="drop")
+
+
+def soft_top_k(score: jax.Array, k: jax.Array, temperature: jax.Array) -> jax.Array:
+    """Return f32[N], how much of a human each robot gets, at most `k` in total: a relaxation of the `k` highest scores.
+
+    The share of a robot is tanh(s / temperature) sigmoid((s - level) / temperature): 0 where its score s is 0, about 1 well above
+    the level. The level is as low as the total permits. For temperature 0, the shares are 1 for the robots that `allocate` helps
+    when all humans are free, and 0 for others.
+
+    Args:
+        score: f32[N] priority of each robot, >= 0; 0 or NaN = no help.
+        k: i32[] or f32[], number of humans.
+        temperature: f32[] > 0, in units of scores.
+
+    The level is found by bisection; a Newton step at its end, which changes nothing, gives it its derivative (the implicit
+    function theorem), so that both modes of differentiation work.
+    """
+    k, score = jnp.asarray(k, score.dtype), jnp.where(score > 0, score, 0.0)  # a NaN is not > 0
+    sought = jnp.tanh(score / temperature)
+
+    def shares(level: jax.Array, score: jax.Array, sought: jax.Array, temperature: jax.Array) -> jax.Array:
+        return sought * jax.nn.sigmoid((score - level) / temperature)
+
+    fixed = jax.lax.stop_gradient((score, sought, temperature))
+    lowest, highest = -40.0 * fixed[2], jnp.max(fixed[0]) + 40.0 * fixed[2]  # there sigmoids are 1 and 0 to rounding
+
+    def halve(_: int, bounds: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        low, high = bounds
+        middle = (low + high) / 2
+        too_many = jnp.sum(shares(middle, *fixed)) > k
+        return jnp.where(too_many, middle, low), jnp.where(too_many, high, middle)
+
+    level = jax.lax.fori_loop(0, 40, halve, (lowest, highest))[1]
+    at_level = shares(level, *fixed)
+    slope = -jnp.sum(at_level * (1.0 - at_level / jnp.maximum(fixed[1], 1e-30))) / fixed[2]
+    total = jnp.sum(shares(level, score, sought, temperature))
+    newton = level - (total - jax.lax.stop_gradient(total)) / jnp.minimum(slope, -1e-12)
+    scarce = jnp.sum(fixed[1]) > k  # else the level stays below all scores
+    return shares(jnp.where(scarce, newton, lowest), score, sought, temperature)

@@ -32,7 +32,7 @@ def state_shapes(config: Config, env: Env) -> FleetState:
     def blank(config: Config, key: jax.Array) -> FleetState:
         parts = make_parts(config, env)
         zeros = jnp.zeros(env.spec.observation_size)
-        data = imitation.create_data(env.spec, ensemble_size=config.ensemble_size, capacity=config.human_capacity)
+        data = imitation.data_of(config, env.spec)
         policy = parts.learner.init(key, Normalizer(zeros, zeros, zeros[0]))
         return init(parts, key, policy, data, {name: e.init(key, data, policy) for name, e in parts.estimators.items()})
 

@@ -15,6 +15,7 @@ from jax.core import Tracer
 from fleetjax import envs, priority, supervisors
 from fleetjax.field import FIELDS, KINDS, Field, Fields, owners
 from fleetjax.physics.base import BACKENDS
+from fleetjax.priority import estimators_of
 from fleetjax.registry import unknown
 
 
@@ -52,6 +53,7 @@ class Config(Fields):
         return _with_capacity(self, dataclasses.replace(self, **typed, parameters=own), changes)
 
 
+ALLOCATIONS = ("hard", "soft")
 _LARGEST = 2**31 - 1
 _LARGEST_EXACT = 2**24  # beyond it f32 skips whole numbers
 _OFFLINE = ("num_demonstrations", "extra_demonstrations")
@@ -261,6 +263,8 @@ def validate(config: Config, env: "envs.Env | None" = None) -> None:
         raise ValueError(f"hidden_sizes = {config.hidden_sizes} must be one or more numbers, each at least 1")
     if config.backend not in BACKENDS:
         raise ValueError(unknown("backend", config.backend, BACKENDS))
+    if config.allocation not in ALLOCATIONS:
+        raise ValueError(unknown("allocation", config.allocation, ALLOCATIONS))
     algorithm = priority.get_algorithm(config.algorithm)
     if config.algorithm == "expert" and config.num_humans != config.num_robots:
         raise ValueError(
@@ -278,11 +282,34 @@ def validate(config: Config, env: "envs.Env | None" = None) -> None:
             f"augmented_copies = {config.augmented_copies} needs images, and environment = {env.spec.name!r} has none; "
             "leave it at 1"
         )
-    if "goal" in algorithm.estimators and not env.spec.has_goal:
+    algorithm.check(config, env.spec)
+    if config.allocation == "soft":
+        _check_soft(config, algorithm, env)
+    if "goal" in estimators_of(algorithm, env.spec) and not env.spec.has_goal:
         raise ValueError(
             f"algorithm = {config.algorithm!r} needs a goal to learn from, and environment = {env.spec.name!r} has none; "
             "choose another algorithm, or an environment with goals"
         )
+
+
+def _check_soft(config: Config, algorithm: priority.Algorithm, env: envs.Env) -> None:
+    """Check that a run can be relaxed.
+
+    Raises:
+        ValueError: if it cannot; the message says what can.
+    """
+    if not algorithm.differentiable:
+        raise ValueError(
+            f"allocation = 'soft' needs scores with derivatives, and those of algorithm = {config.algorithm!r} are ranks or "
+            "chance; choose algorithm = 'weighted'"
+        )
+    if env.spec.discrete or (env.success_margin is None and env.spec.success_return is None):
+        raise ValueError(
+            f"allocation = 'soft' cannot relax environment = {env.spec.name!r}: its actions are discrete, or nothing says how far "
+            "a robot is from success (Env.success_margin)"
+        )
+    if not isinstance(config.temperature, Tracer) and np.any(np.asarray(config.temperature) <= 0):
+        raise ValueError(f"temperature = {config.temperature} must be positive for allocation = 'soft'")
 
 
 def _check_range(name: str, value: Any, field: Field) -> None:

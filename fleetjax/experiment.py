@@ -1,5 +1,7 @@
 """A whole experiment: pre-train, then one scan over the fleet's timesteps; and the evaluation of what was learnt."""
 
+import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -84,7 +86,8 @@ def extend(state: FleetState, num_pairs: int) -> FleetState:
         return jnp.pad(rows, [(0, int(num_pairs) if i == axis else 0) for i in range(rows.ndim)])
 
     pairs = data.pairs._replace(rows=jax.tree.map(grow, data.pairs.rows))
-    return state._replace(human_data=data._replace(pairs=pairs, resample=grow(data.resample)))
+    weight = None if data.weight is None else grow(data.weight)
+    return state._replace(human_data=data._replace(pairs=pairs, resample=grow(data.resample), weight=weight))
 
 
 def run(config: Config, key: jax.Array, state: FleetState | None = None, env: envs.Env | None = None) -> Result:
@@ -149,8 +152,25 @@ def simulate(
         after, (counts, interventions) = logged_step(parts, state, key_at(key, state.timestep))
         return after, (counts, interventions if logged else None)
 
-    last, (metrics, interventions) = jax.lax.scan(timestep, start, length=config.num_steps)
+    scan = scan_in_blocks if config.allocation == "soft" else jax.lax.scan
+    last, (metrics, interventions) = scan(timestep, start, length=config.num_steps)
     return Result(metrics, last), interventions
+
+
+def scan_in_blocks(step: Callable[[Any, None], tuple[Any, Any]], carry: Any, *, length: int) -> tuple[Any, Any]:
+    """Scan as `jax.lax.scan` does, with memory for reverse-mode differentiation that grows with the root of the length.
+
+    Only the carries between blocks of about sqrt(length) steps are kept; a block is computed again when its turn comes.
+    """
+    size = math.isqrt(length)
+    number, rest = divmod(length, size)
+
+    def block(carry: Any, _: None) -> tuple[Any, Any]:
+        return jax.lax.scan(step, carry, length=size)
+
+    carry, outputs = jax.lax.scan(jax.checkpoint(block), carry, length=number)
+    carry, last = jax.lax.scan(jax.checkpoint(step), carry, length=rest)
+    return carry, jax.tree.map(lambda x, y: jnp.concatenate([x.reshape(-1, *x.shape[2:]), y]), outputs, last)
 
 
 @in_32_bits
@@ -180,4 +200,4 @@ def evaluate(config: Config, key: jax.Array, policy: PolicyState, env: envs.Env 
 
 def without_teleoperation(config: Config) -> Config:
     """Return a configuration in which humans only reset robots in violation, and nothing is learnt."""
-    return config.replace(algorithm="constraint")
+    return config.replace(algorithm="constraint", allocation="hard")

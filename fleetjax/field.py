@@ -59,6 +59,7 @@ class Fields:
     algorithm: str = _static("cur", "name of the algorithm, or an order of the letters c, u, r")
     supervisor: str = _static("", "name of the supervisor; empty = the environment's own")
     backend: str = _static("auto", "physics backend: native (CPU threads), mjx (pure JAX), auto")
+    allocation: str = _static("hard", "hard, or soft: relaxed for derivatives (algorithms with differentiable scores)")
     num_robots: int = _static(100, "robots N", low=1)
     num_humans: int = _static(10, "human supervisors M, at most N", low=1)
     num_steps: int = _static(10_000, "operation time T", "timesteps", low=1)
@@ -87,6 +88,9 @@ class Fields:
         0.05, "robots below this uncertainty count as certain; in nats where actions are discrete"
     )
     risk_threshold: float = _traced(0.5, "robots below this risk count as safe", high=1)
+    temperature: float = _traced(
+        0.1, "how far the soft allocation is from the hard one, in units of scores; the hard one is its limit for 0"
+    )
     learning_rate: float = _traced(3e-4, "Adam's learning rate, policy and critics")
     normalize_observations: bool = _traced(
         True, "scale observations by the mean and standard deviation of the demonstrations (images: by a fixed scale)"
@@ -118,6 +122,12 @@ PARAMETERS: dict[str, Mapping[str, Field]] = {
     "thrifty_dagger": {
         "thrifty_weight": Field("weight of the chance of failure", high=1, default=0.25),
         "thrifty_threshold": Field("normalised scores at or below this become 0", default=3.25),
+    },
+    "weighted": {
+        "violation_weight": Field("weight of a violation", default=100.0),
+        "uncertainty_weight": Field("weight of the uncertainty, in units of its threshold", default=10.0),
+        "risk_weight": Field("weight of the risk, in units of its threshold", default=1.0),
+        "goal_weight": Field("weight of the chance not to reach the goal; needs an environment with goals", default=0.0),
     },
     **{letters: {"idle_humans_teleoperate": _IDLE} for letters in ORDERS_WITH_C},
 }

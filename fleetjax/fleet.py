@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from fleetjax import metrics, priority, supervisors
-from fleetjax.allocation import Allocator, helper_of
+from fleetjax.allocation import Allocator, helper_of, soft_top_k
 from fleetjax.config import Config
 from fleetjax.envs import Env
 from fleetjax.keys import Keys, split_keys
@@ -53,6 +53,7 @@ class FleetState(NamedTuple):
         estimators: state of each estimator that the algorithm names, by name.
         priority: the priority's own memory.
         origin: what it was prepared for.
+        weight: f32[N] how much of a human each robot had at the last timestep, in the soft allocation; None in the hard one.
     """
 
     timestep: jax.Array
@@ -65,6 +66,7 @@ class FleetState(NamedTuple):
     estimators: dict[str, Any]
     priority: Any
     origin: Origin = Origin("", "")
+    weight: Any = None
 
     @property
     def learner(self) -> PolicyState:
@@ -108,7 +110,8 @@ def make_parts(config: Config, env: Env) -> Parts:
     algorithm = priority.get_algorithm(config.algorithm)
     supervisor = supervisors.make(config.supervisor or env.spec.supervisor, env)
     learner = imitation.make_learner(config, env.spec)
-    estimators = {name: ESTIMATORS.get(name)(config, env, learner, supervisor) for name in algorithm.estimators}
+    learnt = priority.estimators_of(algorithm, env.spec)
+    estimators = {name: ESTIMATORS.get(name)(config, env, learner, supervisor) for name in learnt}
     rule, allocator = algorithm.make_priority(config), algorithm.make_allocate(config)
     return Parts(config, env, algorithm, rule, allocator, supervisor, learner, estimators)
 
@@ -146,6 +149,7 @@ def init(parts: Parts, key: jax.Array, policy: PolicyState, data: HumanData, est
         estimators=estimators,
         priority=parts.rule.init(),
         origin=Origin(parts.env.spec.name, config.algorithm),
+        weight=jnp.zeros(n, jnp.float32) if config.allocation == "soft" else None,
     )
 
 
@@ -168,7 +172,16 @@ def plan(parts: Parts, state: FleetState, keys: Keys, available: jax.Array | Non
     helped = helper_of(humans, config.num_robots) >= 0
     resetting, teleoperated = helped & signals.violation, helped & ~signals.violation
     humans = restart_clocks(humans, state.resetting, resetting, config.hard_reset_time)
-    return state._replace(priority=memory), Plan(signals, signals.robot_action, score, humans, teleoperated, resetting)
+    weight = None if state.weight is None else share(parts, state, score, min_time)
+    return state._replace(priority=memory), Plan(signals, signals.robot_action, score, humans, teleoperated, resetting, weight)
+
+
+def share(parts: Parts, state: FleetState, score: jax.Array, min_time: jax.Array) -> jax.Array:
+    """Return f32[N], how much of a human each robot gets in the soft allocation: what it had, if its human is bound to it."""
+    helper = helper_of(state.humans, parts.config.num_robots)
+    bound = (helper >= 0) & (state.humans.duration[helper] < min_time)
+    free = parts.config.num_humans - jnp.sum(bound)
+    return jnp.where(bound, state.weight, soft_top_k(jnp.where(bound, 0.0, score), free, parts.config.temperature))
 
 
 def act(
@@ -177,20 +190,48 @@ def act(
     """Do what was planned; return also the robots' states after their step, before resets and new goals."""
     chex.assert_shape(human_action, (parts.config.num_robots, parts.env.spec.action_size))
     given, moving = given & planned.teleoperated, ~state.env.violation
-    action = jnp.where(given[:, None], human_action, planned.robot_action)
+    action = blend(planned, human_action, given)
     stepped, sound = step_robots(parts, state.env, action, moving, keys)
     steps = Step(state.env.obs, action, stepped.obs, stepped.violation, stepped.success, planned.robot_action, given)
     humans = planned.humans._replace(duration=jnp.where(planned.humans.robot >= 0, planned.humans.duration + 1, 0))
     correction = jnp.where(given & sound, jnp.mean((human_action - planned.robot_action) ** 2, axis=-1), 0.0)
-    before, state = state, remember(parts, state, steps, given & sound, moving & sound, keys)
+    taught = Pair(state.env.obs, human_action)
+    before, state = state, remember(parts, state, steps, taught, planned.weight, given & sound, moving & sound, keys)
     renewed, reset_done = renew(parts, stepped, planned, humans, moving, keys)
     state, loss = learn(parts, state, keys)
     state = state._replace(
-        timestep=before.timestep + 1, env=renewed, humans=humans, resetting=planned.resetting, correction=correction
+        timestep=before.timestep + 1,
+        env=renewed,
+        humans=humans,
+        resetting=planned.resetting,
+        correction=correction,
+        weight=planned.weight,
     )
     dropped = state.human_data.dropped - jnp.where(before.timestep > 0, before.human_data.dropped, 0)
     learnt = (reset_done, dropped, find_divergence(state), loss)
-    return state, metrics.measure(parts.config, planned, before.humans, stepped, moving, *learnt), stepped
+    counts = metrics.measure(parts.config, planned, before.humans, stepped, moving, *learnt)
+    return state, counts if planned.weight is None else relax(parts, counts, planned.weight, stepped, moving), stepped
+
+
+def blend(planned: Plan, human_action: jax.Array, given: jax.Array) -> jax.Array:
+    """Return f32[N, A] what robots do: what a human gave them, or their policy; a mixture in the soft allocation."""
+    if planned.weight is None:
+        return jnp.where(given[:, None], human_action, planned.robot_action)
+    return planned.robot_action + planned.weight[:, None] * (human_action - planned.robot_action)
+
+
+def relax(parts: Parts, counts: Metrics, weight: jax.Array, stepped: EnvState, moving: jax.Array) -> Metrics:
+    """Return the metrics of the soft allocation: human time by weights f32[N], successes by sigmoids of their margins."""
+    env, config = parts.env, parts.config
+    if env.success_margin:
+        margin = jax.vmap(env.success_margin)(stepped)
+        judged = moving & ~stepped.violation
+    else:  # by returns, at the end of an episode
+        margin = (stepped.episode_return - config.success_return) / jnp.maximum(jnp.abs(config.success_return), 1.0)
+        judged = moving & stepped.timeout
+    reached = jnp.where(judged, jax.nn.sigmoid(margin / config.temperature), 0.0)
+    teleoperated = jnp.where(moving, weight, 0.0)
+    return counts._replace(successes=jnp.sum(reached), human_steps=jnp.sum(weight), teleop_steps=jnp.sum(teleoperated))
 
 
 def observe(parts: Parts, state: FleetState, keys: Keys) -> Signals:
@@ -239,11 +280,22 @@ def step_robots(parts: Parts, env: EnvState, action: jax.Array, moving: jax.Arra
     return contain(stepped, sound), sound
 
 
-def remember(parts: Parts, state: FleetState, steps: Step, taught: jax.Array, moved: jax.Array, keys: Keys) -> FleetState:
+def remember(
+    parts: Parts,
+    state: FleetState,
+    steps: Step,
+    pairs: Pair,
+    weight: jax.Array | None,
+    taught: jax.Array,
+    moved: jax.Array,
+    keys: Keys,
+) -> FleetState:
     """Record what humans did where they `taught` bool[N], and what happened where robots `moved` bool[N]."""
     data = state.human_data
     if parts.algorithm.updates:
-        data = parts.learner.append(data, Pair(steps.obs, steps.action), taught, keys.data)
+        before, data = data, parts.learner.append(data, pairs, taught, keys.data)
+        if weight is not None:
+            data = imitation.weigh(before, data, weight, taught)
     estimators = {name: estimator.append(state.estimators[name], steps, moved) for name, estimator in parts.estimators.items()}
     return state._replace(human_data=data, estimators=estimators)
 

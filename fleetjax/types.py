@@ -91,6 +91,7 @@ class Plan(NamedTuple):
         humans: HumanState[M], the allocation; `duration` counts the timesteps before this one.
         teleoperated: bool[N] robots that a human teleoperates.
         resetting: bool[N] robots that a human resets.
+        weight: f32[N] how much of a human each robot gets, in the soft allocation; None in the hard one.
     """
 
     signals: Signals
@@ -99,6 +100,7 @@ class Plan(NamedTuple):
     humans: HumanState
     teleoperated: jax.Array
     resetting: jax.Array
+    weight: Any = None
 
 
 class Interventions(NamedTuple):

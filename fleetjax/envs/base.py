@@ -64,6 +64,8 @@ class Env(NamedTuple):
             None if a success ends the episode.
         scene: how to draw its bodies; None if there are none.
         picture: `EnvState -> u8[H, W, 3]`, what people see of it where there is no scene; None if nothing.
+        success_margin: `EnvState -> f32[]` how far a step went beyond success, in units of its tolerance: positive where
+            `success`, negative elsewhere; None if the environment judges by returns, or success cannot be relaxed.
     """
 
     reset: Callable[[jax.Array, jax.Array], EnvState]
@@ -72,6 +74,7 @@ class Env(NamedTuple):
     next_goal: Callable[[EnvState, jax.Array], EnvState] | None = None
     scene: Scene | None = None
     picture: Callable[[EnvState], jax.Array] | None = None
+    success_margin: Callable[[EnvState], jax.Array] | None = None
 
 
 def begin(physics: Any, obs: jax.Array) -> EnvState:

@@ -32,7 +32,7 @@ FLOOR, WALL, GOAL, ROBOT, STUCK = (238, 236, 230), (70, 74, 84), (96, 180, 110),
 def make_env() -> base.Env:
     """Build the navigation environment: 8 observations (position, velocity, goal, way to the goal), 2 actions."""
     spec = base.EnvSpec("navigation", 8, 2, HORIZON, CONTROL_STEP, has_goal=True, supervisor="navigation")
-    return base.Env(_reset, _step, spec, picture=draw)
+    return base.Env(_reset, _step, spec, picture=draw, success_margin=_success_margin)
 
 
 def _reset(key: jax.Array, robot: jax.Array) -> EnvState:
@@ -74,6 +74,11 @@ def _step(state: EnvState, action: jax.Array, active: jax.Array, key: jax.Array)
         success=distance < GOAL_RADIUS,
         horizon=HORIZON,
     )
+
+
+def _success_margin(state: EnvState) -> jax.Array:
+    """Return how far the robot is within the goal's radius, in radii."""
+    return 1.0 - jnp.linalg.norm(state.physics[4:] - state.physics[:2]) / GOAL_RADIUS
 
 
 def hits_wall(position: jax.Array) -> jax.Array:

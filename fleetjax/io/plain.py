@@ -10,6 +10,7 @@ from fleetjax.config import Config, all_fields, get_value, validate
 from fleetjax.field import KINDS
 from fleetjax.io.files import expect
 
+_LATER = ("allocation", "temperature")  # fields that version 0.1 did not have; their defaults are what it did
 _LARGEST = 2**31 - 1  # traced integers are i32
 
 
@@ -31,6 +32,7 @@ def from_plain(fields: Mapping[str, Any]) -> Config:
         ValueError: if they are not those of a configuration.
     """
     known = all_fields(fields.get("algorithm", ""))
+    fields = {name: known[name].default for name in _LATER if name in known} | dict(fields)
     for problem, names in (("unknown", set(fields) - set(known)), ("missing", set(known) - set(fields))):
         expect(not names, f"{problem} fields: {', '.join(sorted(names))} (another version of fleetjax?)")
     for name, value in fields.items():

@@ -34,11 +34,13 @@ class HumanData(NamedTuple):
         pairs: Buffer of `Pair`.
         resample: i32[capacity, E] for each member, the pairs that it learns from; `pairs.size` of them count.
         dropped: i32[] pairs so far for which there was no room.
+        weight: f32[capacity] how much each pair counts, in the soft allocation; None in the hard one, where all count alike.
     """
 
     pairs: buffer.Buffer
     resample: jax.Array
     dropped: jax.Array
+    weight: Any = None
 
 
 class PolicyState(NamedTuple):
@@ -54,11 +56,18 @@ def num_members(spec: EnvSpec, ensemble_size: int) -> int:
     return 1 if spec.discrete else ensemble_size
 
 
-def create_data(spec: EnvSpec, *, ensemble_size: int, capacity: int) -> HumanData:
-    """Return an empty data set."""
+def create_data(spec: EnvSpec, *, ensemble_size: int, capacity: int, weighted: bool = False) -> HumanData:
+    """Return an empty data set, in which pairs may have weights; those of demonstrations are 1."""
     example = Pair(stored_obs(spec), jnp.zeros(spec.action_size))
     resample = jnp.zeros((capacity, num_members(spec, ensemble_size)), jnp.int32)
-    return HumanData(buffer.create(example, capacity), resample, jnp.zeros((), jnp.int32))
+    weight = jnp.ones(capacity, jnp.float32) if weighted else None
+    return HumanData(buffer.create(example, capacity), resample, jnp.zeros((), jnp.int32), weight)
+
+
+def data_of(config: Config, spec: EnvSpec) -> HumanData:
+    """Return the empty data set of a run."""
+    soft = config.allocation == "soft"
+    return create_data(spec, ensemble_size=config.ensemble_size, capacity=config.human_capacity, weighted=soft)
 
 
 def stored_obs(spec: EnvSpec) -> jax.Array:
@@ -75,7 +84,13 @@ def append(data: HumanData, pairs: Pair, mask: jax.Array, key: jax.Array) -> Hum
     draws = buffer.draw_index(key, (data.resample.shape[1], mask.shape[0]), grown.size)
     index = buffer.append(buffer.Buffer(data.resample, data.pairs.added), draws.T, mask, overwrite=False)
     added = grown.added - data.pairs.added
-    return HumanData(grown, index.rows, data.dropped + jnp.sum(mask, dtype=jnp.int32) - added)
+    return HumanData(grown, index.rows, data.dropped + jnp.sum(mask, dtype=jnp.int32) - added, data.weight)
+
+
+def weigh(before: HumanData, after: HumanData, weight: jax.Array, mask: jax.Array) -> HumanData:
+    """Return the data in which the pairs that led from `before` to `after`, where `mask` bool[K], count by `weight` f32[K]."""
+    known = buffer.append(buffer.Buffer(before.weight, before.pairs.added), weight, mask, overwrite=False)
+    return after._replace(weight=known.rows)
 
 
 def append_augmented(
@@ -139,17 +154,19 @@ def make_learner(config: Config, spec: EnvSpec) -> Learner:
             return jax.nn.one_hot(jnp.argmax(log_p, axis=-1), spec.action_size), -jnp.sum(jnp.exp(log_p) * log_p, axis=-1)
         return jnp.mean(answers, axis=0), jnp.mean(jnp.var(answers, axis=0), axis=-1)  # on [-1, 1] no variance exceeds 1
 
-    def loss(params: Any, obs: jax.Array, action: jax.Array) -> jax.Array:
+    def loss(params: Any, obs: jax.Array, action: jax.Array, weight: jax.Array | None) -> jax.Array:
         answer = network.apply(params, obs)
         if spec.discrete:
             return jnp.mean(optax.softmax_cross_entropy(answer, action))
-        return jnp.mean((jnp.tanh(answer) - action) ** 2)
+        error = (jnp.tanh(answer) - action) ** 2
+        return jnp.mean(error if weight is None else weight[:, None] * error)
 
     def update(state: PolicyState, data: HumanData, key: jax.Array) -> tuple[PolicyState, jax.Array]:
         draw = buffer.draw_index(key, (members, config.batch_size), data.pairs.size)
         index = data.resample[draw, jnp.arange(members)[:, None]]
         batch = take(data.pairs.rows, index)
-        losses, grads = jax.vmap(jax.value_and_grad(loss))(state.params, state.normalizer(batch.obs), batch.action)
+        weight = None if data.weight is None else data.weight[index]
+        losses, grads = jax.vmap(jax.value_and_grad(loss))(state.params, state.normalizer(batch.obs), batch.action, weight)
         params, opt_state = descend(state.params, grads, state.opt_state, config.learning_rate)
         return state._replace(params=params, opt_state=opt_state), jnp.mean(losses)
 

@@ -120,7 +120,7 @@ def pretrain(
     """
     key_demos, key_init, key_policy = jax.random.split(key, 3)
     pretrains = priority.get_algorithm(config.algorithm).pretrains
-    data = imitation.create_data(env.spec, ensemble_size=config.ensemble_size, capacity=config.human_capacity)
+    data = imitation.data_of(config, env.spec)
     if pretrains:
         data = collect_demonstrations(config, env, supervisor, learner.append, data, key_demos)
     if env.spec.image_shape:

@@ -15,6 +15,7 @@ from fleetjax.priority.base import (
     ALGORITHMS,
     Algorithm,
     Priority,
+    estimators_of,
     get_algorithm,
     list_algorithms,
     register_algorithm,
@@ -24,20 +25,23 @@ from fleetjax.priority.base import (
 from fleetjax.priority.baselines import BASELINES
 from fleetjax.priority.dagger import DAGGERS
 from fleetjax.priority.orders import RULES
-from fleetjax.priority.ranks import above, lexicographic
+from fleetjax.priority.ranks import above, lexicographic, softly_above
+from fleetjax.priority.weighted import WEIGHTED
 
 __all__ = [
     "ALGORITHMS",
     "Algorithm",
     "Priority",
     "above",
+    "estimators_of",
     "get_algorithm",
     "lexicographic",
     "list_algorithms",
     "register_algorithm",
     "register_priority",
+    "softly_above",
     "stateless",
 ]
 
-for _name, _algorithm in {**BASELINES, **DAGGERS, **RULES}.items():
+for _name, _algorithm in {**BASELINES, **DAGGERS, **WEIGHTED, **RULES}.items():
     register_algorithm(_name, _algorithm)

@@ -39,7 +39,11 @@ class Algorithm:
             gives `Signals.goal`, all are in `Signals.estimates`.
         make_allocate: `config -> Allocator`; by default the paper's Algorithm 1.
         parameters: this algorithm's own, by name; traced. A rule reads `config.parameters["name"]`.
+        optional: those of the estimators that are left out where the environment has no goals.
         defaults: `config -> fields` of `Config` whose defaults it overrides.
+        check: `(config, EnvSpec) -> None` raises ValueError for a configuration that it cannot use.
+        differentiable: whether scores have derivatives by its parameters, as weighted sums do and ranks do not; the soft
+            allocation needs it.
         sees_supervisor: whether `Signals.human_action` is filled, for upper bounds that no real fleet could reach.
         pretrains: whether demonstrations are collected and the policy is cloned before the fleet starts.
         updates: whether human data are recorded and learnt from while the fleet runs.
@@ -50,7 +54,10 @@ class Algorithm:
     estimators: tuple[str, ...] = ()
     make_allocate: Callable[[Any], Allocator] = lambda config: allocate
     parameters: Mapping[str, Field] = dataclasses.field(default_factory=dict)
+    optional: tuple[str, ...] = ()
     defaults: Callable[[Any], Mapping[str, Any]] = lambda config: {}
+    check: Callable[[Any, Any], None] = lambda config, spec: None
+    differentiable: bool = False
     sees_supervisor: bool = False
     pretrains: bool = True
     updates: bool = True
@@ -75,6 +82,7 @@ def register_priority(
     *,
     estimators: tuple[str, ...] = ("safety",),
     parameters: Mapping[str, Field] | None = None,
+    differentiable: bool = False,
 ) -> None:
     """Make a rule available as an algorithm that clones demonstrations and learns from interventions.
 
@@ -83,11 +91,14 @@ def register_priority(
         make_priority: `config -> Priority`.
         estimators: registered names of what it reads: `"safety"` for `Signals.risk`, `"goal"` for `Signals.goal`.
         parameters: what this algorithm alone has, by name.
+        differentiable: whether its scores have derivatives by its parameters; see `Algorithm`.
 
     Raises:
         ValueError: if the name is taken.
     """
-    register_algorithm(name, Algorithm(make_priority, estimators=tuple(estimators), parameters=dict(parameters or {})))
+    own = dict(parameters or {})
+    algorithm = Algorithm(make_priority, estimators=tuple(estimators), parameters=own, differentiable=differentiable)
+    register_algorithm(name, algorithm)
 
 
 def list_algorithms() -> tuple[str, ...]:
@@ -102,3 +113,8 @@ def get_algorithm(name: str) -> Algorithm:
         ValueError: if there is none of that name; the message has the closest ones.
     """
     return ALGORITHMS.get(name)
+
+
+def estimators_of(algorithm: Algorithm, spec: Any) -> tuple[str, ...]:
+    """Return the names of what an algorithm learns in an environment with this `EnvSpec`."""
+    return tuple(name for name in algorithm.estimators if spec.has_goal or name not in algorithm.optional)

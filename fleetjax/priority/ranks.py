@@ -27,3 +27,8 @@ def lexicographic(*columns: jax.Array) -> jax.Array:
 def above(values: jax.Array, threshold: jax.Array) -> jax.Array:
     """Return `values`, with those below `threshold` set to 0."""
     return jnp.where(values >= threshold, values, 0.0)
+
+
+def softly_above(values: jax.Array, threshold: jax.Array | float, temperature: jax.Array) -> jax.Array:
+    """Return `values` times a sigmoid that rises from 0 to 1 about `threshold`; for temperature 0 it is `above`."""
+    return values * jax.nn.sigmoid((values - threshold) / temperature)

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from fleetjax.experiment import Result, evaluate, extend, prepare, run, run_logged
     from fleetjax.field import Field
     from fleetjax.fleet import Fleet, FleetState, make_fleet
+    from fleetjax.gradients import Sensitivity, sensitivity
     from fleetjax.io.comparing import compare
     from fleetjax.io.comparison import Comparison
     from fleetjax.io.figure import plot
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from fleetjax.metrics import Metrics, first_divergence, rohe
     from fleetjax.priority import Algorithm, Priority, list_algorithms, register_algorithm, register_priority
     from fleetjax.supervisors import Supervisor, list_supervisors, register_supervisor
+    from fleetjax.tuning import Tuned, tune
     from fleetjax.types import EnvState, HumanState, Interventions, Plan, Signals
 
 __version__ = VERSION
@@ -42,9 +44,11 @@ __all__ = [
     "Plan",
     "Priority",
     "Result",
+    "Sensitivity",
     "Signals",
     "Step",
     "Supervisor",
+    "Tuned",
     "allocate",
     "check_env",
     "compare",
@@ -67,6 +71,8 @@ __all__ = [
     "rohe",
     "run",
     "run_logged",
+    "sensitivity",
+    "tune",
     "validate",
 ]
 
@@ -86,7 +92,9 @@ _NAMES = {
     "learning.estimators": ["Estimator", "Step", "register_estimator"],
     "metrics": ["Metrics", "first_divergence", "rohe"],
     "priority": ["Algorithm", "Priority", "list_algorithms", "register_algorithm", "register_priority"],
+    "gradients": ["Sensitivity", "sensitivity"],
     "supervisors": ["Supervisor", "list_supervisors", "register_supervisor"],
+    "tuning": ["Tuned", "tune"],
     "types": ["EnvState", "HumanState", "Interventions", "Plan", "Signals"],
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names}

@@ -90,20 +90,20 @@ def helper_of(humans: HumanState, num_robots: int) -> jax.Array:
     return jnp.full(num_robots, -1, jnp.int32).at[place].set(jnp.arange(num_humans, dtype=jnp.int32), mode="drop")
 
 
-def soft_top_k(score: jax.Array, k: jax.Array, temperature: jax.Array) -> jax.Array:
+def soft_top_k(score: jax.Array, k: jax.Array, temperature: jax.Array | float) -> jax.Array:
     """Return f32[N], how much of a human each robot gets, at most `k` in total: a relaxation of the `k` highest scores.
 
-    The share of a robot is tanh(s / temperature) sigmoid((s - level) / temperature): 0 where its score s is 0, about 1 well above
-    the level. The level is as low as the total permits. For temperature 0, the shares are 1 for the robots that `allocate` helps
-    when all humans are free, and 0 for others.
+    The share of a robot with score s is tanh(s / temperature) sigmoid((s - level) / temperature): 0 for score 0, and about 1
+    well above the level, which is as low as the total permits. As the temperature falls to 0, shares become 1 for the robots
+    that `allocate` helps when all humans are free, and 0 for the others. Robots with equal scores have equal shares.
 
     Args:
         score: f32[N] priority of each robot, >= 0; 0 or NaN = no help.
         k: i32[] or f32[], number of humans.
         temperature: f32[] > 0, in units of scores.
 
-    The level is found by bisection; a Newton step at its end, which changes nothing, gives it its derivative (the implicit
-    function theorem), so that both modes of differentiation work.
+    The level is found by bisection. A Newton step at the end, whose value is 0, gives it the derivative that the implicit
+    function theorem says, in both modes of differentiation.
     """
     k, score = jnp.asarray(k, score.dtype), jnp.where(score > 0, score, 0.0)  # a NaN is not > 0
     sought = jnp.tanh(score / temperature)

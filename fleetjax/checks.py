@@ -72,13 +72,13 @@ def check_memory(config: Config, state: FleetState) -> None:
     learnt = jax.tree.leaves(state.estimators, is_leaf=lambda x: isinstance(x, Buffer))
     stores = [x for x in learnt if isinstance(x, Buffer)]
     parts = {
-        "num_robots": _bytes(state.env),
-        "hidden_sizes": 2 * _bytes(state.policy) + _bytes([x for x in learnt if not isinstance(x, Buffer)]),
-        "human_capacity": _bytes(state.human_data),
-        "critic_capacity": _bytes(stores),
+        "num_robots": count_bytes(state.env),
+        "hidden_sizes": 2 * count_bytes(state.policy) + count_bytes([x for x in learnt if not isinstance(x, Buffer)]),
+        "human_capacity": count_bytes(state.human_data),
+        "critic_capacity": count_bytes(stores),
         "num_steps": config.num_steps * 4 * len(Metrics._fields),
     }
-    needed, limit = sum(parts.values()), _memory()
+    needed, limit = sum(parts.values()), memory()
     if needed > limit:
         largest = max(parts, key=lambda name: parts[name])
         raise ValueError(
@@ -87,11 +87,12 @@ def check_memory(config: Config, state: FleetState) -> None:
         )
 
 
-def _bytes(tree: Any) -> int:
+def count_bytes(tree: Any) -> int:
+    """Return the size of a pytree of arrays, or of their shapes."""
     return sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
 
 
-def _memory() -> int:
+def memory() -> int:
     """Return the bytes of memory of the default device; on a CPU, what this process may have of the machine's."""
     stats = jax.local_devices()[0].memory_stats()
     if stats and "bytes_limit" in stats:

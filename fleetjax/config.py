@@ -305,8 +305,8 @@ def _check_soft(config: Config, algorithm: priority.Algorithm, env: envs.Env) ->
         )
     if env.spec.discrete or (env.success_margin is None and env.spec.success_return is None):
         raise ValueError(
-            f"allocation = 'soft' cannot relax environment = {env.spec.name!r}: its actions are discrete, or nothing says how far "
-            "a robot is from success (Env.success_margin)"
+            f"allocation = 'soft' cannot relax environment = {env.spec.name!r}, whose actions are discrete, or whose successes "
+            "have no Env.success_margin"
         )
     if not isinstance(config.temperature, Tracer) and np.any(np.asarray(config.temperature) <= 0):
         raise ValueError(f"temperature = {config.temperature} must be positive for allocation = 'soft'")

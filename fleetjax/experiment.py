@@ -157,6 +157,11 @@ def simulate(
     return Result(metrics, last), interventions
 
 
+def step_once(config: Config, env: envs.Env, state: FleetState, key: jax.Array) -> FleetState:
+    """Return the state after a run's next timestep."""
+    return logged_step(make_parts(config, env), state, key_at(key, state.timestep))[0]
+
+
 def scan_in_blocks(step: Callable[[Any, None], tuple[Any, Any]], carry: Any, *, length: int) -> tuple[Any, Any]:
     """Scan as `jax.lax.scan` does, with memory for reverse-mode differentiation that grows with the root of the length.
 

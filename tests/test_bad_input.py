@@ -127,12 +127,12 @@ def test_a_supervisor_whose_actions_have_another_size_is_refused(monkeypatch):
 def test_a_run_that_cannot_fit_the_memory_is_refused_with_both_numbers(monkeypatch):
     config = fleetjax.make_config("navigation", "cur", critic_capacity=1_000_000)
     needed = r"critic_capacity = 1000000 is too large: .* 0\.0[1-9] GiB of memory \(0\.0[1-9] GiB for .* only 0\.00 GiB"
-    monkeypatch.setattr(checks, "_memory", lambda: 1000)
+    monkeypatch.setattr(checks, "memory", lambda: 1000)
     with pytest.raises(ValueError, match=needed):
         jax.eval_shape(fleetjax.run, config, jax.random.key(0))
     state = checks.state_shapes(config, fleetjax.envs.make("navigation"))
     held = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
-    monkeypatch.setattr(checks, "_memory", lambda: 2 * held)
+    monkeypatch.setattr(checks, "memory", lambda: 2 * held)
     checks.check_run(config)
 
 

@@ -1,7 +1,5 @@
 """A weighted sum of violation, uncertainty, risk and chance of failure: C.U.R. with weights to differentiate by."""
 
-from collections.abc import Sequence
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,7 +30,7 @@ def weighted(config) -> Priority:
     def score(signals, key):
         del key
         total = (
-            own["violation_weight"] * signals.violation.astype(jnp.float32)
+            own["violation_weight"] * signals.violation.astype(signals.uncertainty.dtype)
             + own["uncertainty_weight"] * in_units(signals.uncertainty, config.uncertainty_threshold)
             + own["risk_weight"] * in_units(signals.risk, config.risk_threshold)
         )

@@ -1,0 +1,312 @@
+"""How much more a fleet is worth if a parameter changes: gradients by perturbed runs, by a relaxed fleet, or forwards.
+
+A fleet decides by thresholds, ranks and resets, so the derivative of one run is not that of the mean over runs. `smoothed` is
+unbiased for the mean over Gaussian perturbations, whatever the fleet does. `relaxed` and `forward` differentiate through the
+timesteps, and do not see what stays hard.
+
+References: Suh et al., Do differentiable simulators give better policy gradients?, 2022; Metz et al., Gradients are not all you
+need, 2021; Nesterov and Spokoiny, Random gradient-free minimization of convex functions, 2017 (smoothing).
+"""
+
+import math
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+
+from fleetjax import checks
+from fleetjax.config import Config, all_fields, get_value
+from fleetjax.envs import Env
+from fleetjax.experiment import prepare, run, step_once
+from fleetjax.field import Field
+from fleetjax.fleet import FleetState
+from fleetjax.metrics import Metrics, rohe
+from fleetjax.precision import in_32_bits
+from fleetjax.registry import unknown
+
+METHODS = ("smoothed", "relaxed", "forward")
+WIDTH = 0.1  # deviation of perturbations, in units of a field's value
+_NOISE = 2**32 - 1  # folded into a run's key for the noise; `keys.key_at` folds in timesteps
+Objective = Callable[[Metrics, Config], jax.Array]
+Values = dict[str, jax.Array]
+
+
+class Sensitivity(NamedTuple):
+    """What a fleet is worth, and its derivatives; all are means over keys.
+
+    Attributes:
+        value: f32[] the objective.
+        gradient: f32[] by field, its derivative.
+        standard_error: f32[] by field, of that; NaN where one key has one sample.
+    """
+
+    value: jax.Array
+    gradient: Values
+    standard_error: Values
+
+
+def final_return(metrics: Metrics, config: Config) -> jax.Array:
+    """Return f32[], the return on human effort at the end of a run."""
+    return rohe(metrics, config)[-1]
+
+
+@in_32_bits
+def sensitivity(
+    config: Config,
+    keys: jax.Array,
+    fields: str | Sequence[str],
+    *,
+    objective: Objective | None = None,
+    method: str = "smoothed",
+    width: float | Mapping[str, float] | None = None,
+    num_samples: int = 64,
+    env: Env | None = None,
+) -> Sensitivity:
+    """Return the derivatives of what a fleet is worth by some of its parameters.
+
+    The fleet is prepared once for each key, and this state is held fixed: derivatives are those of what happens from t = 0.
+
+    Args:
+        config: configuration.
+        keys: random key, or keys [S]. One run of each key takes the place of a sample of fleets.
+        fields: names of traced fields, or of parameters of the algorithm.
+        objective: `(Metrics[T], config) -> f32[]`; by default the return on human effort at the end.
+        method: `"smoothed"`: differences between runs whose fields are shifted up and down by the same Gaussian noise. Works
+            everywhere. `"relaxed"`: reverse mode through the run with `allocation = "soft"`. For environments in plain JAX, and
+            algorithms with differentiable scores such as `weighted`. `"forward"`: forward mode through the run as configured,
+            one field after the other. For environments on MJX, too.
+        width: of the noise in `"smoothed"`, its standard deviation: a number in units of each field's value (0.1 if None),
+            or a mapping from fields to widths. Shifted values beyond a field's range count as its bound.
+        num_samples: shifted runs for each key in `"smoothed"`, an even number.
+        env: the environment, if it is not the registered one that the configuration names.
+
+    Returns:
+        Sensitivity. Its standard error is over keys; in `"smoothed"` it is at least that of the samples.
+
+    Raises:
+        ValueError: if a field is unknown, static, or of a kind that the method cannot differentiate by, the method does not
+            work with this configuration, or the run does not fit the memory; the message says what would work.
+
+    Warns:
+        UserWarning: if the objective did not depend on a field.
+    """
+    request = check_request(config, keys, fields, method, width, num_samples, env)
+    config, env, names = request.config, request.env, request.names
+    derive = make_gradient(config, env, objective or final_return, names, method, request.widths, num_samples)
+
+    def of_key(key: jax.Array) -> tuple[jax.Array, Values, Values]:
+        return derive({name: get_value(config, name) for name in names}, key, prepare(config, key, env))
+
+    values, gradients, variances = jax.lax.map(of_key, request.keys)
+    found = Sensitivity(
+        jnp.mean(values),
+        {name: jnp.mean(gradients[name]) for name in names},
+        {name: _standard_error(gradients[name], variances[name]) for name in names},
+    )
+    _warn_of_zeros(found, method)
+    return found
+
+
+class Request(NamedTuple):
+    """What was asked for, checked.
+
+    Attributes:
+        config: configuration, relaxed if need be.
+        keys: keys [S].
+        names: of the fields.
+        widths: of the noise on each; empty without noise.
+        env: environment.
+    """
+
+    config: Config
+    keys: jax.Array
+    names: tuple[str, ...]
+    widths: Values
+    env: Env
+
+
+def check_request(
+    config: Config,
+    keys: jax.Array,
+    fields: str | Sequence[str],
+    method: str,
+    width: float | Mapping[str, float] | None,
+    num_samples: int,
+    env: Env | None,
+) -> Request:
+    """Check what `sensitivity` is asked for, before anything is computed.
+
+    Raises:
+        ValueError: as `sensitivity`.
+    """
+    names = (fields,) if isinstance(fields, str) else tuple(fields)
+    keys = _as_keys(keys)
+    if method not in METHODS:
+        raise ValueError(unknown("method", method, METHODS))
+    _check_fields(config, names, method)
+    if num_samples < 2 or num_samples % 2:
+        raise ValueError(f"num_samples = {num_samples} must be even, and at least 2: runs come in pairs")
+    if method == "relaxed":
+        config = config.replace(allocation="soft")
+    env = checks.check_run(config, env)
+    if method != "smoothed":
+        _check_derivatives(config, env, method)
+    return Request(config, keys, names, _widths(config, names, width) if method == "smoothed" else {}, env)
+
+
+def make_gradient(
+    config: Config, env: Env, worth: Objective, names: Sequence[str], method: str, widths: Values, num_samples: int
+) -> Callable[[Values, jax.Array, FleetState], tuple[jax.Array, Values, Values]]:
+    """Return `(values by field, key, state) -> (objective, gradient, variance of the gradient)` of runs from a state."""
+
+    def objective(values: Values, key: jax.Array, state: FleetState) -> jax.Array:
+        changed = config.replace(**values)
+        return worth(run(changed, key, state, env).metrics, changed)
+
+    def smoothed(values: Values, key: jax.Array, state: FleetState) -> tuple[jax.Array, Values, Values]:
+        known = all_fields(config.algorithm)
+        noise = jax.random.normal(jax.random.fold_in(key, _NOISE), (num_samples // 2, len(names)))
+
+        def shifted(z: jax.Array, sign: int) -> jax.Array:
+            moved = {n: _within(known[n], values[n].astype(jnp.float32) + sign * widths[n] * z[i]) for i, n in enumerate(names)}
+            return objective(moved, key, state)
+
+        rises = jax.lax.map(lambda z: (shifted(z, 1) - shifted(z, -1)) / 2, noise)
+        slopes = {name: rises * noise[:, i] / widths[name] for i, name in enumerate(names)}
+        gradient = {name: jnp.mean(slope) for name, slope in slopes.items()}
+        ddof = min(1, num_samples // 2 - 1)
+        variance = {name: jnp.var(slope, ddof=ddof) / (num_samples // 2) for name, slope in slopes.items()}
+        return objective(values, key, state), gradient, variance
+
+    def relaxed(values: Values, key: jax.Array, state: FleetState) -> tuple[jax.Array, Values, Values]:
+        value, gradient = jax.value_and_grad(objective)(values, key, state)
+        return value, gradient, jax.tree.map(jnp.zeros_like, gradient)
+
+    def forward(values: Values, key: jax.Array, state: FleetState) -> tuple[jax.Array, Values, Values]:
+        value, push = jax.linearize(lambda values: objective(values, key, state), values)
+        zeros = jax.tree.map(jnp.zeros_like, values)
+        gradient = {name: push(zeros | {name: jnp.ones_like(values[name])}) for name in names}
+        return value, gradient, zeros
+
+    return {"smoothed": smoothed, "relaxed": relaxed, "forward": forward}[method]
+
+
+def _within(field: Field, value: jax.Array) -> jax.Array:
+    """Return a value as a field can hold it: within its range, and whole if need be."""
+    value = jnp.clip(value, field.low, field.high)
+    return jnp.round(value).astype(jnp.int32) if field.kind is int else value
+
+
+def _standard_error(gradients: jax.Array, variances: jax.Array) -> jax.Array:
+    """Return f32[], the error of the mean over keys: from their spread, but no less than what their samples tell."""
+    number = gradients.shape[0]
+    within = jnp.mean(variances) / number
+    if number == 1:
+        return jnp.sqrt(jnp.where(within > 0, within, jnp.nan))
+    return jnp.sqrt(jnp.maximum(jnp.var(gradients, ddof=1) / number, within))
+
+
+def _as_keys(keys: jax.Array) -> jax.Array:
+    """Return keys [S]."""
+    if not (isinstance(keys, jax.Array) and jnp.issubdtype(keys.dtype, jax.dtypes.prng_key) and keys.ndim < 2 and keys.size):
+        raise ValueError("keys must be a key or an array of keys: jax.random.split(jax.random.key(0), 8)")
+    return keys.reshape(-1)
+
+
+def _check_fields(config: Config, names: Sequence[str], method: str) -> None:
+    """Check that there are derivatives by these fields."""
+    known = all_fields(config.algorithm)
+    if not names or len(set(names)) < len(names):
+        raise ValueError(f"fields = {list(names)} must name one or more fields, each once")
+    for name in names:
+        config.replace(**{name: get_value(config, name)} if name in known else {name: 0})  # an unknown name is refused
+        field = known[name]
+        if not field.traced or field.kind is bool:
+            raise ValueError(f"field {name} is {'static' if not field.traced else 'a switch'}; there is no derivative by it")
+        if field.kind is int and method != "smoothed":
+            raise ValueError(f"field {name} is a whole number, by which only method = 'smoothed' works, not {method!r}")
+
+
+def _widths(config: Config, names: Sequence[str], width: float | Mapping[str, float] | None) -> Values:
+    """Return the standard deviation of the noise on each field."""
+    given = width if isinstance(width, Mapping) else {}
+    unknown_names = set(given) - set(names)
+    if unknown_names:
+        raise ValueError(f"width names {', '.join(sorted(unknown_names))}, which is not among fields")
+    share = WIDTH if width is None or isinstance(width, Mapping) else width
+    widths = {name: given[name] if name in given else share * abs(_concrete(config, name)) for name in names}
+    for name, found in widths.items():
+        if not found > 0:
+            raise ValueError(f"width of {name} = {found} must be positive; pass width={{{name!r}: ...}}")
+    return {name: jnp.float32(found) for name, found in widths.items()}
+
+
+def _concrete(config: Config, name: str) -> float:
+    value = get_value(config, name)
+    if isinstance(value, Tracer):
+        raise ValueError(f"{name} is traced, so the width of its noise must be given: width={{{name!r}: ...}}")
+    return float(value)
+
+
+def _check_derivatives(config: Config, env: Env, method: str) -> None:
+    """Check that an environment can be differentiated, and that reverse mode fits the memory.
+
+    Raises:
+        ValueError: if not; the message says which method would work.
+    """
+    state = jax.eval_shape(lambda: env.reset(jax.random.key(0), jnp.int32(0)))
+
+    def works(transform: Callable[..., Any]) -> bool:
+        def derive(state: Any, key: jax.Array) -> Any:
+            def rewarded(action: jax.Array) -> jax.Array:
+                return env.step(state, action, jnp.ones((), bool), key).reward
+
+            return transform(rewarded, jnp.zeros(env.spec.action_size))
+
+        try:
+            jax.eval_shape(derive, state, jax.random.key(0))
+        except (ValueError, NotImplementedError, TypeError):
+            return False
+        return True
+
+    name, other = env.spec.name, ", or backend = 'mjx' for method = 'forward'" if config.backend in ("auto", "native") else ""
+    if not works(lambda f, x: jax.jvp(f, (x,), (x,))):
+        raise ValueError(
+            f"method = {method!r} needs derivatives of environment = {name!r}, and with backend = {config.backend!r} there are "
+            f"none; use method = 'smoothed'{other}"
+        )
+    if method == "relaxed" and not works(lambda f, x: jax.grad(f)(x)):
+        raise ValueError(
+            f"method = 'relaxed' needs reverse-mode derivatives, and environment = {name!r} has only forward ones; use "
+            "method = 'forward' or 'smoothed'"
+        )
+    if method == "relaxed":
+        needed, limit = reverse_bytes(config, env), checks.memory()
+        if needed > limit:
+            raise ValueError(
+                f"num_steps = {config.num_steps} is too large for method = 'relaxed': it needs about {needed / 2**30:,.1f} GiB "
+                f"of memory, and {limit / 2**30:,.1f} GiB are available; shorten the run, or use method = 'smoothed'"
+            )
+
+
+def reverse_bytes(config: Config, env: Env) -> int:
+    """Return about how many bytes reverse mode through a run keeps: the state of each block, and of one block all steps."""
+    size = math.isqrt(config.num_steps)
+    state = checks.state_shapes(config, env)
+
+    def residuals(state: FleetState, key: jax.Array) -> Any:
+        return jax.vjp(lambda s: step_once(config, env, s, key), state)[1]
+
+    kept = jax.eval_shape(residuals, state, jax.random.key(0))
+    return checks.count_bytes(state) * (config.num_steps // size + 2) + checks.count_bytes(kept) * size
+
+
+def _warn_of_zeros(found: Sensitivity, method: str) -> None:
+    """Warn of fields on which the objective did not depend, where numbers are known."""
+    for name, slope in found.gradient.items():
+        if not isinstance(slope, Tracer) and slope == 0:
+            other = "" if method == "smoothed" else "; thresholds and ranks have none in this method: try method = 'smoothed'"
+            warnings.warn(f"the objective did not depend on {name}: its derivative is exactly 0{other}", stacklevel=4)

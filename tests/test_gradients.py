@@ -1,0 +1,311 @@
+"""Gradients of a fleet's worth: the soft allocation and its limit, three ways to a gradient, and tuning along it."""
+
+import math
+from functools import partial
+from typing import Any
+
+import hypothesis.extra.numpy as hnp
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import compiled
+from hypothesis import given
+from hypothesis import strategies as st
+
+import fleetjax
+from fleetjax import checks, gradients
+from fleetjax.allocation import soft_top_k
+from fleetjax.config import get_value
+from fleetjax.experiment import scan_in_blocks
+from fleetjax.priority import get_algorithm
+
+TINY = {
+    "num_robots": 5,
+    "num_humans": 2,
+    "num_steps": 6,
+    "ensemble_size": 2,
+    "hidden_sizes": (6,),
+    "batch_size": 8,
+    "gradient_steps": 1,
+    "critic_capacity": 200,
+    "num_demonstrations": 60,
+    "pretraining_steps": 20,
+    "critic_pretraining_steps": 5,
+    "num_critic_transitions": 60,
+    "initial_period": 0,
+}
+KEYS = jax.random.split(jax.random.key(3), 2)
+SCORES = hnp.arrays(np.float64, 8, elements=st.floats(0, 100), unique=True)
+
+
+@pytest.fixture(scope="module")
+def config():
+    return fleetjax.make_config("navigation", "weighted", **TINY)
+
+
+# --- the soft top k ---
+
+
+@given(SCORES, st.integers(0, 8), st.floats(0.01, 10))
+def test_shares_are_at_most_k_in_total_and_rise_with_the_score(score, k, temperature):
+    shares = np.asarray(soft_top_k(jnp.asarray(score, jnp.float32), jnp.int32(k), jnp.float32(temperature)))
+    assert np.all((shares >= 0) & (shares <= 1))
+    assert shares.sum() <= k + 1e-3
+    assert np.all(shares[score == 0] == 0)
+    assert np.all(np.diff(shares[np.argsort(score)]) >= -1e-6)
+    if k < 8 and np.tanh(score / temperature).sum() > k:
+        np.testing.assert_allclose(shares.sum(), k, atol=1e-3)
+
+
+@given(SCORES, st.integers(1, 7))
+def test_the_limit_of_temperature_0_is_the_hard_choice(score, k):
+    score = np.round(score)
+    score[:3] = [0, 150, 160]
+    score += np.arange(8) / 8 * (score > 0)  # no ties
+    free = fleetjax.HumanState(jnp.full(k, -1), jnp.zeros(k, jnp.int32))
+    humans = fleetjax.allocate(jnp.asarray(score, jnp.float32), free, jnp.ones(8, jnp.int32), jax.random.key(0))
+    helped = np.isin(np.arange(8), humans.robot)
+    shares = soft_top_k(jnp.asarray(score, jnp.float32), jnp.int32(k), jnp.float32(1e-3))
+    np.testing.assert_allclose(shares, helped, atol=1e-3)
+
+
+@pytest.mark.parametrize("ties", [False, True])
+@pytest.mark.parametrize(("k", "temperature"), [(10, 1.0), (10, 0.1), (40, 0.3), (90, 5.0)])
+def test_derivatives_of_shares_are_those_of_differences(k, temperature, ties):
+    with jax.enable_x64(True):
+        rng = np.random.default_rng(0)
+        score = jnp.asarray(np.abs(rng.normal(size=100)) * (rng.random(100) < 0.8))
+        if ties:
+            score = jnp.round(score)
+        weights, step = jnp.asarray(rng.normal(size=100)), jnp.asarray(rng.normal(size=100)) * (score > 0).astype(jnp.float64)
+
+        def worth(score, temperature):
+            return jnp.sum(weights * soft_top_k(score, jnp.int32(k), temperature))
+
+        by_score, by_temperature = jax.grad(worth, (0, 1))(score, jnp.float64(temperature))
+        h = 1e-6
+        rise = worth(score + h * step, temperature) - worth(score - h * step, temperature)
+        np.testing.assert_allclose(by_score @ step, rise / (2 * h), rtol=3e-4, atol=1e-8)
+        rise = worth(score, temperature + h) - worth(score, temperature - h)
+        np.testing.assert_allclose(by_temperature, rise / (2 * h), rtol=3e-4, atol=1e-8)
+        forward = jax.jvp(lambda s: worth(s, temperature), (score,), (step,))[1]
+        np.testing.assert_allclose(forward, by_score @ step, rtol=1e-9)
+
+
+def test_a_scan_in_blocks_is_a_scan_with_the_same_derivative():
+    def step(carry, _):
+        carry = jnp.sin(carry) + 0.5 * carry
+        return carry, carry
+
+    def total(scan, length, x):
+        last, every = scan(step, x, length=length)
+        return last + jnp.sum(every**2), every
+
+    for length in (1, 2, 3, 7, 16, 23):
+        one, other = (partial(total, scan, length) for scan in (jax.lax.scan, scan_in_blocks))
+        (value, every), slope = jax.value_and_grad(one, has_aux=True)(jnp.float32(0.3))
+        (value_, every_), slope_ = jax.value_and_grad(other, has_aux=True)(jnp.float32(0.3))
+        np.testing.assert_allclose([value, slope], [value_, slope_], rtol=1e-6)
+        np.testing.assert_array_equal(every, every_)
+
+
+# --- the weighted sum ---
+
+FAR = 1e5
+LIMITS = {
+    "cur": (FAR**2, FAR, 1.0),
+    "uc": (1.0, FAR, 0.0),
+    "cu": (FAR, 1.0, 0.0),
+    "ur": (0.0, FAR, 1.0),
+    "rc": (1.0, 0.0, FAR),
+    "c": (1.0, 0.0, 0.0),
+}
+
+
+def in_64_bits(x):
+    return x.astype(jnp.float64) if x.dtype == jnp.float32 else x
+
+
+@pytest.mark.parametrize("letters", LIMITS)
+def test_orders_are_limits_of_weights_far_apart(letters):
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
+        weights = dict(zip(("violation_weight", "uncertainty_weight", "risk_weight"), LIMITS[letters], strict=True))
+        period = 20 if "c" in letters else 0  # other orders have none
+        weighted = fleetjax.make_config("navigation", "weighted", initial_period=period, **weights)
+        order = fleetjax.make_config("navigation", letters, initial_period=20)
+        weighted, order = (jax.tree.map(in_64_bits, c) for c in (weighted, order))
+        rules = [get_algorithm(c.algorithm).make_priority(c) for c in (weighted, order)]
+        rng, n, m = np.random.default_rng(1), 30, 6
+        humans = fleetjax.HumanState(jnp.full(m, -1), jnp.zeros(m, jnp.int32))
+        helped = 0
+        for t in range(60):
+            signals = fleetjax.Signals(
+                violation=jnp.asarray(rng.random(n) < 0.2),
+                uncertainty=jnp.asarray(rng.choice(rng.random(12) * 0.1, n)),  # equal ones among them
+                risk=jnp.asarray(rng.choice(rng.random(12), n)),
+                goal=jnp.zeros(n),
+                timestep=jnp.int32(t),
+            )
+            key = jax.random.fold_in(jax.random.key(0), t)
+            scores = [rule.score(signals, rule.init(), key)[0] for rule in rules]
+            chosen, same = (fleetjax.allocate(s, humans, jnp.full(n, 3), key) for s in scores)
+            np.testing.assert_array_equal(chosen.robot, same.robot)
+            humans, helped = chosen._replace(duration=chosen.duration + 1), helped + np.sum(chosen.robot >= 0)
+        assert helped > 60
+
+
+def test_a_weighted_fleet_learns_the_goal_only_where_there_is_one(config):
+    assert set(checks.state_shapes(config, fleetjax.envs.make("navigation")).estimators) == {"safety", "goal"}
+    humanoid = fleetjax.make_config("humanoid", "weighted")
+    assert set(checks.state_shapes(humanoid, fleetjax.envs.make("humanoid")).estimators) == {"safety"}
+
+
+# --- the soft fleet ---
+
+
+def test_the_soft_fleet_is_the_hard_one_at_temperature_0():
+    hard = fleetjax.make_config("navigation", "weighted", **{**TINY, "num_steps": 40, "uncertainty_threshold": 0.01})
+    soft = hard.replace(allocation="soft", temperature=1e-4)
+    one, other = (compiled(fleetjax.run)(c, KEYS[0]).metrics for c in (hard, soft))
+    assert one.teleop_steps.sum() > 20
+    np.testing.assert_allclose(other.teleop_steps, one.teleop_steps, atol=0.05)
+    np.testing.assert_array_equal(other.violations, one.violations)
+    np.testing.assert_allclose(other.reward, one.reward, rtol=1e-3, atol=1e-4)
+    assert other.human_steps.dtype == jnp.float32
+
+
+# --- gradients ---
+
+
+def human_time(metrics, config):
+    return jnp.sum(metrics.human_steps) / config.num_steps
+
+
+@pytest.fixture(scope="module")
+def smooth(config):
+    """A configuration with thresholds that robots are near, and a state of its fleet."""
+    config = config.replace(allocation="soft", temperature=0.5, uncertainty_threshold=0.05)
+    return config, compiled(fleetjax.prepare)(config, KEYS[0])
+
+
+@pytest.mark.slow
+def test_the_relaxed_gradient_is_that_of_differences(smooth):
+    config, state = smooth
+    names = ("uncertainty_threshold", "risk_threshold", "uncertainty_weight", "risk_weight", "goal_weight", "learning_rate")
+    values = {name: get_value(config, name) + (0.5 if name == "goal_weight" else 0.0) for name in names}
+
+    def worth(values):
+        metrics = fleetjax.run(config.replace(**values), KEYS[1], state).metrics
+        return jnp.sum(metrics.human_steps) + jnp.sum(metrics.reward) + jnp.sum(metrics.policy_loss)
+
+    slopes, worth = compiled(jax.grad(worth))(values), compiled(worth)
+    for name in names:
+        width = 1e-2 * values[name]
+        above, below = (worth({**values, name: values[name] + sign * width}) for sign in (1, -1))
+        np.testing.assert_allclose(slopes[name], (above - below) / (2 * width), rtol=0.01, atol=1e-4, err_msg=name)
+
+
+def test_smoothed_gradients_are_those_of_the_mean(config):
+    def worth(metrics, config):
+        return config.uncertainty_threshold**2 + 3 * config.parameters["risk_weight"] + 0 * jnp.sum(metrics.reward)
+
+    found = fleetjax.sensitivity(config, KEYS, ["uncertainty_threshold", "risk_weight"], objective=worth, num_samples=200)
+    expected = {"uncertainty_threshold": 2 * 0.03, "risk_weight": 3.0}
+    np.testing.assert_allclose(found.value, 0.03**2 + 3, rtol=1e-6)
+    for name, slope in expected.items():
+        error = found.standard_error[name]
+        assert abs(found.gradient[name] - slope) < 4 * error
+    # of the products of two normal numbers: the noise of the other field counts, too
+    noise = {
+        "uncertainty_threshold": math.hypot(2**0.5 * 0.06, 0.3 / 0.003),
+        "risk_weight": math.hypot(2**0.5 * 3, 0.00018 / 0.1),
+    }
+    for name, deviation in noise.items():
+        assert 0.5 < found.standard_error[name] / (deviation / 200**0.5) < 2.5
+
+
+def test_whole_numbers_can_be_smoothed(config):
+    worth = lambda metrics, config: config.min_teleop_time.astype(jnp.float32) ** 2  # noqa: E731
+    found = fleetjax.sensitivity(
+        config, KEYS[0], "min_teleop_time", objective=worth, width={"min_teleop_time": 2.0}, num_samples=400
+    )
+    assert abs(found.gradient["min_teleop_time"] - 10) < 4 * found.standard_error["min_teleop_time"] < 10
+
+
+@pytest.mark.slow
+def test_relaxed_and_forward_gradients_agree(config):
+    soft = config.replace(allocation="soft", temperature=0.5)
+    fields = ("uncertainty_threshold", "risk_weight", "learning_rate")
+    reverse = fleetjax.sensitivity(config.replace(temperature=0.5), KEYS, fields, method="relaxed", objective=human_time)
+    forward = fleetjax.sensitivity(soft, KEYS, fields, method="forward", objective=human_time)
+    np.testing.assert_allclose(forward.value, reverse.value, rtol=1e-5)
+    for name in fields:
+        np.testing.assert_allclose(forward.gradient[name], reverse.gradient[name], rtol=1e-2, atol=1e-5)
+        np.testing.assert_allclose(forward.standard_error[name], reverse.standard_error[name], rtol=1e-2, atol=1e-5)
+    assert reverse.gradient["uncertainty_threshold"] < 0
+
+
+def test_a_field_that_does_not_matter_is_told(config):
+    with pytest.warns(UserWarning, match="did not depend on learning_rate"):
+        fleetjax.sensitivity(config, KEYS[0], "learning_rate", objective=lambda m, c: jnp.float32(1), num_samples=2)
+
+
+def test_tuning_climbs_and_stays_within_the_range(config):
+    def worth(metrics, config):
+        return -(((config.uncertainty_threshold - 0.02) / 0.01) ** 2) + 10 * config.risk_threshold
+
+    fields = ("uncertainty_threshold", "risk_threshold")
+    tuned = fleetjax.tune(config, KEYS, fields, steps=60, objective=worth, method="forward")
+    np.testing.assert_allclose(tuned.config.uncertainty_threshold, 0.02, rtol=0.03)
+    np.testing.assert_allclose(tuned.config.risk_threshold, 1.0)
+    assert tuned.values["risk_threshold"].shape == (61,)
+    assert tuned.values["risk_threshold"][0] == 0.5
+    assert np.max(tuned.values["risk_threshold"]) <= 1
+    assert tuned.objective[-1] > tuned.objective[0]
+
+
+def refused(config, *, fields: Any = "risk_threshold", keys=KEYS, **options):
+    with pytest.raises(ValueError, match=r"\w") as error:
+        fleetjax.sensitivity(config, keys, fields, **options)
+    return str(error.value)
+
+
+def test_bad_requests_are_refused_before_anything_is_computed(config, monkeypatch):
+    monkeypatch.setattr(gradients, "prepare", None)
+    assert "risk_threshold" in refused(config, fields="risk_treshold")
+    assert "num_robots is static" in refused(config, fields="num_robots")
+    assert "normalize_observations is a switch" in refused(config, fields="normalize_observations")
+    assert "method = 'smoothed'" in refused(config, fields="initial_period", method="relaxed")
+    assert "each once" in refused(config, fields=())
+    assert "each once" in refused(config, fields=("risk_threshold", "risk_threshold"))
+    assert "random_threshold is a parameter of algorithm = 'random'" in refused(config, fields="random_threshold")
+    assert "num_samples = 3" in refused(config, num_samples=3)
+    assert "method = 'reverse'" in refused(config, method="reverse")
+    assert "keys must be" in refused(config, keys=jnp.zeros(2, jnp.uint32))
+    assert "width of goal_weight = 0.0" in refused(config, fields="goal_weight")
+    assert "width names risk_weight" in refused(config, width={"risk_weight": 1.0})
+    cur = fleetjax.make_config("navigation", "cur", **TINY)
+    assert "'weighted'" in refused(cur, method="relaxed")
+    pixels = fleetjax.make_config("block_push", "weighted", num_steps=5)
+    assert "success_margin" in refused(pixels, method="relaxed")
+    native = fleetjax.make_config("humanoid", "weighted", **{**TINY, "backend": "native"})
+    assert "use method = 'smoothed', or backend = 'mjx'" in refused(native, method="forward")
+    needed = gradients.reverse_bytes(config.replace(allocation="soft"), fleetjax.envs.make("navigation"))
+    monkeypatch.setattr(checks, "memory", lambda: needed - 1)
+    assert "num_steps = 6 is too large" in refused(config, method="relaxed")
+    for name in ("uncertainty_threshold", "risk_threshold"):
+        with pytest.raises(ValueError, match=f"{name} = 0"):
+            fleetjax.make_config("navigation", "weighted", **{name: 0.0})
+    with pytest.raises(ValueError, match="goal_weight = 1"):
+        fleetjax.make_config("humanoid", "weighted", goal_weight=1.0)
+    with pytest.raises(ValueError, match="temperature = 0"):
+        config.replace(allocation="soft", temperature=0.0) and fleetjax.validate(
+            config.replace(allocation="soft", temperature=0.0)
+        )
+
+
+@pytest.mark.slow
+def test_mjx_has_only_forward_derivatives():
+    config = fleetjax.make_config("humanoid", "weighted", **{**TINY, "backend": "mjx"})
+    assert "use method = 'forward' or 'smoothed'" in refused(config, method="relaxed")

@@ -105,7 +105,8 @@ def soft_top_k(score: jax.Array, k: jax.Array, temperature: jax.Array | float) -
     The level is found by bisection. A Newton step at the end, whose value is 0, gives it the derivative that the implicit
     function theorem says, in both modes of differentiation.
     """
-    k, score = jnp.asarray(k, score.dtype), jnp.where(score > 0, score, 0.0)  # a NaN is not > 0
+    score = jnp.where(score > 0, score, 0.0)  # a NaN is not > 0
+    k, temperature = (jnp.asarray(x, score.dtype) for x in (k, temperature))
     sought = jnp.tanh(score / temperature)
 
     def shares(level: jax.Array, score: jax.Array, sought: jax.Array, temperature: jax.Array) -> jax.Array:

@@ -300,9 +300,7 @@ def test_bad_requests_are_refused_before_anything_is_computed(config, monkeypatc
     with pytest.raises(ValueError, match="goal_weight = 1"):
         fleetjax.make_config("humanoid", "weighted", goal_weight=1.0)
     with pytest.raises(ValueError, match="temperature = 0"):
-        config.replace(allocation="soft", temperature=0.0) and fleetjax.validate(
-            config.replace(allocation="soft", temperature=0.0)
-        )
+        fleetjax.validate(config.replace(allocation="soft", temperature=0.0))
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from fleetjax.config import Config, all_fields, get_value, validate
 from fleetjax.field import KINDS
 from fleetjax.io.files import expect
 
-_LATER = ("allocation", "temperature")  # fields that version 0.1 did not have; their defaults are what it did
+_LATER = ("allocation", "temperature")  # fields that came later; their defaults are what was done before
 _LARGEST = 2**31 - 1  # traced integers are i32
 
 

@@ -25,6 +25,10 @@ _KNOWN = {
         "robots that are uncertain or unlikely to reach their goal first, then robots in violation",
     ),
     "expert": ("Expert", "every robot is teleoperated and nothing is learnt: an upper bound on successes"),
+    "weighted": (
+        "Weighted sum",
+        "as cur, but by a weighted sum of violation, uncertainty and risk: for derivatives by the weights",
+    ),
     "cur": ("C.U.R.", "robots in violation first, then by uncertainty, then by risk: the paper's proposal"),
 }
 ORDERS = "any order of distinct letters from c (violation), u (uncertainty) and r (risk); uc: first uncertainty, then violation"

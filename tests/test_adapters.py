@@ -81,6 +81,7 @@ def test_a_state_that_is_no_number_is_a_violation(start, step):
     np.testing.assert_array_equal(after.obs[::2], healthy.obs[::2])
 
 
+@pytest.mark.slow
 def test_fleet_runs_on_brax(pendulum):
     config = fleetjax.make_config(pendulum, "expert", num_robots=4, num_steps=HORIZON + 5, hidden_sizes=(8,), batch_size=16)
     run = compiled(functools.partial(fleetjax.run, env=pendulum))

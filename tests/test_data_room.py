@@ -104,6 +104,7 @@ def test_a_swept_number_of_demonstrations_needs_a_capacity(config, name):
     assert jax.vmap(lambda n: config.replace(human_capacity=200).replace(**{name: n}))(numbers).human_capacity == 200
 
 
+@pytest.mark.slow
 def test_demonstrations_without_room_are_counted_at_the_start(config):
     """Where a sweep's capacity is too small for its larger setting; the smaller one loses nothing."""
     numbers = jnp.array([25, 60])

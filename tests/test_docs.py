@@ -85,6 +85,7 @@ def run_page(name: str) -> dict:
     return names
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("own_registries", "quick_compilation")
 def test_custom_page_runs(capsys):
     metrics = run_page("docs/custom.md")["result"].metrics

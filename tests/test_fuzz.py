@@ -149,7 +149,10 @@ def program():
     return compiled(run)
 
 
-@pytest.mark.parametrize(("algorithm", "shape"), SHAPES, ids=[algorithm for algorithm, _ in SHAPES])
+@pytest.mark.parametrize(
+    ("algorithm", "shape"),
+    [pytest.param(*entry, id=entry[0], marks=[pytest.mark.slow] if entry[0] == "thrifty_dagger" else []) for entry in SHAPES],
+)
 def test_any_setting_keeps_the_invariants(algorithm, shape):
     small = {"hidden_sizes": (4,), "ensemble_size": 2, "batch_size": 4, "critic_capacity": 50, "human_capacity": 1000}
     config = fleetjax.make_config("navigation", algorithm, **small | {"num_steps": T} | shape)

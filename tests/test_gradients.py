@@ -46,10 +46,13 @@ def config():
 
 # --- the soft top k ---
 
+share = jax.jit(soft_top_k)
+assign = jax.jit(fleetjax.allocate)
+
 
 @given(SCORES, st.integers(0, 8), st.floats(0.01, 10))
 def test_shares_are_at_most_k_in_total_and_rise_with_the_score(score, k, temperature):
-    shares = np.asarray(soft_top_k(jnp.asarray(score, jnp.float32), jnp.int32(k), jnp.float32(temperature)))
+    shares = np.asarray(share(jnp.asarray(score, jnp.float32), jnp.int32(k), jnp.float32(temperature)))
     assert np.all((shares >= 0) & (shares <= 1))
     assert shares.sum() <= k + 1e-3
     assert np.all(shares[score == 0] == 0)
@@ -64,9 +67,9 @@ def test_the_limit_of_temperature_0_is_the_hard_choice(score, k):
     score[:3] = [0, 150, 160]
     score += np.arange(8) / 8 * (score > 0)  # no ties
     free = fleetjax.HumanState(jnp.full(k, -1), jnp.zeros(k, jnp.int32))
-    humans = fleetjax.allocate(jnp.asarray(score, jnp.float32), free, jnp.ones(8, jnp.int32), jax.random.key(0))
+    humans = assign(jnp.asarray(score, jnp.float32), free, jnp.ones(8, jnp.int32), jax.random.key(0))
     helped = np.isin(np.arange(8), humans.robot)
-    shares = soft_top_k(jnp.asarray(score, jnp.float32), jnp.int32(k), jnp.float32(1e-3))
+    shares = share(jnp.asarray(score, jnp.float32), jnp.int32(k), jnp.float32(1e-3))
     np.testing.assert_allclose(shares, helped, atol=1e-3)
 
 
@@ -164,6 +167,7 @@ def test_a_weighted_fleet_learns_the_goal_only_where_there_is_one(config):
 # --- the soft fleet ---
 
 
+@pytest.mark.slow
 def test_the_soft_fleet_is_the_hard_one_at_temperature_0():
     hard = fleetjax.make_config("navigation", "weighted", **{**TINY, "num_steps": 40, "uncertainty_threshold": 0.01})
     soft = hard.replace(allocation="soft", temperature=1e-4)
@@ -206,6 +210,7 @@ def test_the_relaxed_gradient_is_that_of_differences(smooth):
         np.testing.assert_allclose(slopes[name], (above - below) / (2 * width), rtol=0.01, atol=1e-4, err_msg=name)
 
 
+@pytest.mark.slow
 def test_smoothed_gradients_are_those_of_the_mean(config):
     def worth(metrics, config):
         return config.uncertainty_threshold**2 + 3 * config.parameters["risk_weight"] + 0 * jnp.sum(metrics.reward)

@@ -128,7 +128,6 @@ CASES = {
     "experiments/clone_error.py": Case(
         ("humanoid --demonstrations 256 --fresh 100 --gradient-steps 2",),
         (row("observation", "256", *[r"\d\.\d{4}"] * 3, r"\d+"), r"variance of the expert's actions \| +\| 0\.\d+"),
-        quick=True,
     ),
     "experiments/first_look.py": Case(
         (

@@ -88,6 +88,7 @@ def test_a_map_over_seeds_and_settings_is_a_loop_bit_for_bit(sweep):
         assert_same(jax.tree.map(lambda x, i=i: x[i], together), alone(config, key))
 
 
+@pytest.mark.slow
 def test_a_vmap_over_seeds_and_settings_is_a_loop_but_for_roundings(tiny, sweep):
     """Over a few timesteps; after many, a last bit may have decided who is helped."""
     each, configs, keys = sweep

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from fleetjax.field import Field
     from fleetjax.fleet import Fleet, FleetState, make_fleet
     from fleetjax.gradients import Sensitivity, sensitivity
+    from fleetjax.io.animation import Animation, animate
     from fleetjax.io.comparing import compare
     from fleetjax.io.comparison import Comparison
     from fleetjax.io.figure import plot
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 __version__ = VERSION
 __all__ = [
     "Algorithm",
+    "Animation",
     "Comparison",
     "Config",
     "Env",
@@ -50,6 +52,7 @@ __all__ = [
     "Supervisor",
     "Tuned",
     "allocate",
+    "animate",
     "check_env",
     "compare",
     "envs",
@@ -86,6 +89,7 @@ _NAMES = {
     "experiment": ["Result", "evaluate", "extend", "prepare", "run", "run_logged"],
     "field": ["Field"],
     "fleet": ["Fleet", "FleetState", "make_fleet"],
+    "io.animation": ["Animation", "animate"],
     "io.comparing": ["compare"],
     "io.comparison": ["Comparison"],
     "io.figure": ["plot"],

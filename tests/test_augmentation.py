@@ -39,6 +39,7 @@ def test_an_augmented_image_is_that_of_the_definition(seed):
     assert np.abs(found - image).mean() > 1
 
 
+@pytest.mark.slow
 def test_changes_have_the_sizes_of_the_paper():
     """On a grey image contrast, blur and saturation change nothing: the additions are within 10, and so on."""
     image = jnp.full(IMAGE_SHAPE, 127.5)

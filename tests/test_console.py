@@ -79,6 +79,7 @@ def test_only_thresholds_that_the_rule_uses_are_named(algorithm, limits, why):
 # The engine
 
 
+@pytest.mark.slow
 def test_simulated_seats_give_the_librarys_run():
     fleet = make_engine()
     rows = [take(fleet, inputs(SIMULATED))[1] for _ in range(SMALL["num_steps"])]

@@ -60,7 +60,9 @@ def spoil_nothing(state, value):
     return state
 
 
-@pytest.mark.parametrize("name", fleetjax.list_envs())
+@pytest.mark.parametrize(
+    "name", [pytest.param(e, marks=[] if e == "navigation" else pytest.mark.slow) for e in fleetjax.list_envs()]
+)
 def test_one_robots_numbers_do_not_reach_its_neighbours(name):
     """State, observation, or a human's action: it is a violation, reset within a few timesteps, and nobody else is touched."""
     config = make_config(name, "u")  # everybody is teleoperated, so that a human's action is taken
@@ -158,6 +160,7 @@ def test_what_diverged_and_when_first_is_told(algorithm, spoil, named):
     assert metrics.first_divergence(jax.tree.map(lambda x: x[:7], counts)) is None
 
 
+@pytest.mark.slow
 def test_learning_that_diverges_is_told():
     """Steps as long as f32 goes blow up the policy, really, in the first timesteps with data."""
     config = make_config("navigation", "cur", gradient_steps=1, learning_rate=3e38, num_demonstrations=20, pretraining_steps=1)

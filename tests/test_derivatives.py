@@ -91,6 +91,7 @@ def loss():
     return lambda rate: jnp.sum(fleetjax.run(config.replace(learning_rate=rate), KEY, state).metrics.policy_loss)
 
 
+@pytest.mark.slow
 def test_a_derivative_in_reverse_is_that_of_a_difference(loss):
     rate, width = jnp.float32(1e-3), 1e-4
     (above, below), slope = compiled(lambda: ([loss(rate + width), loss(rate - width)], jax.grad(loss)(rate)))()

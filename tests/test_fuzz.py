@@ -151,7 +151,7 @@ def program():
 
 @pytest.mark.parametrize(
     ("algorithm", "shape"),
-    [pytest.param(*entry, id=entry[0], marks=[pytest.mark.slow] if entry[0] == "thrifty_dagger" else []) for entry in SHAPES],
+    [pytest.param(*entry, id=entry[0], marks=[] if entry[0] == "cur" else [pytest.mark.slow]) for entry in SHAPES],
 )
 def test_any_setting_keeps_the_invariants(algorithm, shape):
     small = {"hidden_sizes": (4,), "ensemble_size": 2, "batch_size": 4, "critic_capacity": 50, "human_capacity": 1000}

@@ -256,6 +256,7 @@ def test_a_field_that_does_not_matter_is_told(config):
         fleetjax.sensitivity(config, KEYS[0], "learning_rate", objective=lambda m, c: jnp.float32(1), num_samples=2)
 
 
+@pytest.mark.slow
 def test_tuning_climbs_and_stays_within_the_range(config):
     def worth(metrics, config):
         return -(((config.uncertainty_threshold - 0.02) / 0.01) ** 2) + 10 * config.risk_threshold

@@ -286,6 +286,7 @@ LEG = """
 """
 
 
+@pytest.mark.slow
 def test_mjx_is_differentiable_forwards():
     """On a smooth case, a leg that swings, the derivative of a control step equals central differences of MJX itself."""
     leg = mujoco.MjModel.from_xml_string(LEG)

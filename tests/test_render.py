@@ -114,6 +114,7 @@ def test_render_writes_a_gif(tmp_path, capsys):
     assert "already exists" in refused(capsys, "render", "humanoid", "--output", path)
 
 
+@pytest.mark.slow
 @needs_gl
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # imageio leaves ffmpeg's pipe to the collector
 def test_render_writes_an_mp4(tmp_path, capsys):
@@ -155,3 +156,14 @@ def test_a_machine_without_opengl_is_told_what_to_install_before_anything_runs(m
     monkeypatch.setattr(importlib, "import_module", missing)
     monkeypatch.setattr(render, "start", None)
     assert "libosmesa6" in refused(capsys, "render", "humanoid")
+
+
+def test_a_notebook_shows_the_robots_of_a_run(tmp_path):
+    config = fleetjax.make_config("navigation", "expert", num_robots=3, num_humans=3, num_steps=6)
+    shown = fleetjax.animate(config, jax.random.key(0), num_shown=2, every=2, width=40)
+    shown.save(tmp_path / "film.gif")
+    picture = Image.open(tmp_path / "film.gif")
+    assert (picture.n_frames, picture.width) == (3, 2 * 40)
+    assert shown._repr_html_().startswith('<img alt="animated robots" src="data:image/gif;base64,R0lGOD')
+    with pytest.raises(ValueError, match="every = 0"):
+        fleetjax.animate(config, jax.random.key(0), every=0)

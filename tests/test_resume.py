@@ -252,6 +252,7 @@ MANIFESTS = [
 ]
 
 
+@pytest.mark.slow
 def test_every_malformed_manifest_is_passed_over_with_the_reason(stopped):
     run, path = folder.read_run(stopped), newest(stopped)
     intact = json.loads((path / checkpoint.MANIFEST).read_text())
@@ -592,6 +593,7 @@ def test_a_full_disk_during_a_checkpoint_is_told_and_the_older_ones_stay(tmp_pat
     assert_same(path, whole)
 
 
+@pytest.mark.slow
 def test_a_full_disk_during_the_run_is_told_and_the_run_goes_on_later(stopped, whole, spawn):
     size = (stopped / "interventions.bin").stat().st_size + 100
     process = spawn("run", "--resume", stopped, "--checkpoint-every", 0, largest_file=size)

@@ -371,6 +371,7 @@ def test_a_sweep_gives_the_folders_that_plain_runs_give(swept, whole, capsys):
     assert "is already finished" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_runs_of_one_program_compile_nothing_new(whole, compiled, tmp_path):
     compiled.clear()
     runs = planned("navigation", *RANDOM, "--random-threshold", "0.5,0.6", "--learning-rate", "1e-3,1e-4", output=tmp_path)

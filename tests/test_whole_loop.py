@@ -117,6 +117,7 @@ def test_a_run_has_forward_derivatives(tiny):
     assert abs(float(slope)) > 1e-3
 
 
+@pytest.mark.slow
 def test_loop_jitted_is_not_jitted(tiny, run):
     """A timestep by `plan` and `advance`, operation by operation, has the counts and the state of the compiled one."""
     state, key = run(tiny, jax.random.key(2)).state, jax.random.key(3)

@@ -3,6 +3,7 @@
 The paper calls violations hard resets.
 """
 
+import contextlib
 import io
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -55,6 +56,11 @@ _STYLE: dict[Any, Any] = {
     "legend.title_fontsize": 9,
     "svg.fonttype": "none",
 }
+
+
+def style() -> contextlib.AbstractContextManager[None]:
+    """Return a context in which Matplotlib draws as fleetjax does."""
+    return mpl.rc_context(_STYLE)
 
 
 class Curves(NamedTuple):
@@ -121,7 +127,7 @@ def draw(groups: Sequence[Curves], title: str = "") -> Figure:
         groups: what to draw; each environment has its own row of panels.
         title: takes the place of the legend.
     """
-    with mpl.rc_context(_STYLE):
+    with style():
         places = list(dict.fromkeys(curves.environment for curves in groups))
         figure = Figure(figsize=(12.5, 0.5 + 2.6 * len(places)), layout=ConstrainedLayoutEngine(w_pad=0.12))
         axes = figure.subplots(len(places), len(PANELS), squeeze=False)
@@ -204,6 +210,6 @@ def _styles(groups: Sequence[Curves]) -> list[tuple[str, Any]]:
 def render(figure: Figure, suffix: str = ".png") -> bytes:
     """Return a figure as the content of a file of this kind."""
     data = io.BytesIO()
-    with mpl.rc_context(_STYLE):
+    with style():
         figure.savefig(data, format=suffix.removeprefix("."), dpi=160)
     return data.getvalue()

@@ -1,0 +1,201 @@
+"""Check the gradients of `fleetjax.sensitivity` against each other, and against what they promise.
+
+    python experiments/gradient_check.py [CHECK ...] [--seeds 10] [--num-samples 128] [--output FIGURE.png] [-- PARAMETERS]
+
+The checks, each a table:
+
+- `differences`: the relaxed gradient against finite differences of the same objective, one field and seed at a time, where
+  no hard event (a fall, a reset, a change of who helps whom) lies between the two runs, and where one does.
+- `temperature`: relaxed gradients, as the temperature falls, against the smoothed gradient of the hard objective.
+- `steps`: how much a step along each gradient raises the return of the hard fleet on fresh seeds.
+- `length`: how large the relaxed gradient grows with the length of the run.
+
+Gradients are by the logarithm of each field, so that fields of different size compare. PARAMETERS are those of `fleetjax run`.
+"""
+
+import argparse
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+import fleetjax
+from fleetjax import statistics
+from fleetjax.config import FIELDS as FIELDS_OF_A_RUN
+from fleetjax.config import Config, get_value
+from fleetjax.io import figure, files, flags, text
+
+FIELDS = ("uncertainty_threshold", "risk_threshold", "violation_weight", "uncertainty_weight", "risk_weight")
+FLEET = {"num_robots": 20, "num_humans": 2, "num_steps": 300, "initial_period": 0, "critic_capacity": 10_000}
+TEMPERATURES = (1.0, 0.3, 0.1, 0.03, 0.01)
+LENGTHS = (30, 100, 300, 1000)
+STEP = 0.3  # by which a step changes the logarithms of all fields, as a vector
+DIFFERENCE = 1e-2  # half the relative distance of the two runs of a finite difference
+EVENTS = ("violations", "hard_resets", "idle", "switches", "choices")  # counts that differ if a hard event does
+CHECKS = ("differences", "temperature", "steps", "length")
+
+Table = list[tuple[str, ...]]
+
+
+def relative(config: Config, found: fleetjax.Sensitivity) -> np.ndarray:
+    """Return f64[F], the derivatives by the logarithms of the fields."""
+    return np.array([float(found.gradient[name] * get_value(config, name)) for name in FIELDS])
+
+
+def cosine(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the cosine of the angle between two vectors; NaN if one is 0."""
+    return float(a @ b / (np.linalg.norm(a) * np.linalg.norm(b))) if np.any(a) and np.any(b) else float("nan")
+
+
+@jax.jit
+def relaxed(config: Config, keys: jax.Array) -> fleetjax.Sensitivity:
+    """Return the relaxed sensitivity."""
+    return fleetjax.sensitivity(config, keys, FIELDS, method="relaxed")
+
+
+@jax.jit
+def final_returns(config: Config, keys: jax.Array) -> jax.Array:
+    """Return f32[S], the return on human effort of hard runs."""
+    return jax.lax.map(lambda key: fleetjax.rohe(fleetjax.run(config, key).metrics, config)[-1], keys)
+
+
+def check_differences(config: Config, keys: jax.Array) -> Table:
+    """Compare relaxed gradients with finite differences."""
+    soft = config.replace(allocation="soft", temperature=TEMPERATURES[1])
+    prepare = jax.jit(fleetjax.prepare)
+
+    @jax.jit
+    def run(config: Config, key: jax.Array, state: fleetjax.FleetState) -> tuple[jax.Array, list[jax.Array]]:
+        metrics = fleetjax.run(config, key, state).metrics
+        return fleetjax.rohe(metrics, config)[-1], [getattr(metrics, name) for name in EVENTS]
+
+    errors: dict[bool, list[float]] = {False: [], True: []}
+    for key in keys:
+        state, slopes = prepare(soft, key), relaxed(soft, key[None]).gradient
+        for name in FIELDS:
+            value = get_value(soft, name)
+            (high, above), (low, below) = (
+                run(soft.replace(**{name: value * (1 + sign * DIFFERENCE)}), key, state) for sign in (1, -1)
+            )
+            switched = any(np.any(x != y) for x, y in zip(above, below, strict=True))
+            slope, difference = float(slopes[name]), float((high - low) / (2 * DIFFERENCE * value))
+            errors[switched].append(abs(slope - difference) / max(abs(slope), abs(difference), 1e-12))
+    rows: Table = [("hard events between the runs", "pairs", "median error", "90th percentile")]
+    for switched, found in errors.items():
+        shown = [f"{100 * np.quantile(found, q):.2g} %" for q in (0.5, 0.9)] if found else ["-", "-"]
+        rows.append(("some" if switched else "none", str(len(found)), *shown))
+    return rows
+
+
+def by_temperature(config: Config, keys: jax.Array, reference: np.ndarray) -> tuple[Table, list[tuple[float, float]]]:
+    """Compare relaxed gradients with the smoothed one, by temperature; return also the cosine of each temperature."""
+    rows: Table = [("temperature", "cosine", "equal signs", "cosine of one seed, median", "norm")]
+    curve = []
+    for temperature in TEMPERATURES:
+        each = np.array([relative(config, relaxed(config.replace(temperature=temperature), key[None])) for key in keys])
+        mean = each.mean(axis=0)
+        alone = [cosine(one, reference) for one in each]
+        curve.append((temperature, cosine(mean, reference)))
+        signs = f"{np.sum(np.sign(mean) == np.sign(reference))} of {len(FIELDS)}"
+        rows.append(
+            (f"{temperature:g}", f"{curve[-1][1]:.2f}", signs, f"{np.nanmedian(alone):.2f}", f"{np.linalg.norm(mean):.2g}")
+        )
+    return rows, curve
+
+
+def check_steps(config: Config, directions: dict[str, np.ndarray], seeds: Sequence[int]) -> Table:
+    """Take a step along each gradient, and compare the returns of fresh seeds with those before it."""
+    keys = jax.vmap(jax.random.key)(jnp.asarray(seeds))
+    before = np.asarray(final_returns(config, keys), float)
+    rows: Table = [("step along", "return before", "after", "difference", "95 % interval")]
+    for name, direction in directions.items():
+        step = np.exp(STEP * direction / max(np.linalg.norm(direction), 1e-12))
+        values = {f: float(get_value(config, f)) * s for f, s in zip(FIELDS, step, strict=True)}
+        values["risk_threshold"] = min(values["risk_threshold"], 1.0)
+        after = np.asarray(final_returns(config.replace(**values), keys), float)
+        low, high = statistics.mean_bounds(after - before)
+        shown = (f"{x:.3f}" for x in (before.mean(), after.mean(), (after - before).mean()))
+        rows.append((name, *shown, f"{low:.3f} to {high:.3f}"))
+    return rows
+
+
+def by_length(config: Config, keys: jax.Array) -> tuple[Table, list[tuple[int, float]]]:
+    """Return how the norms of relaxed gradients grow with the length of the run."""
+    rows: Table = [("timesteps", "median norm", "largest norm")]
+    curve = []
+    for length in LENGTHS:
+        longer = config.replace(num_steps=length, temperature=TEMPERATURES[1])
+        norms = [np.linalg.norm(relative(config, relaxed(longer, key[None]))) for key in keys]
+        curve.append((length, float(np.median(norms))))
+        rows.append((str(length), f"{np.median(norms):.2g}", f"{max(norms):.2g}"))
+    return rows, curve
+
+
+def draw(curves: dict[str, Iterable[tuple[float, float]]]) -> Figure:
+    """Return a figure of the cosine by temperature and the norm by length."""
+    with figure.style():
+        shown = Figure(figsize=(8, 3), layout="constrained")
+        for axes, (name, curve) in zip(shown.subplots(1, len(curves), squeeze=False)[0], curves.items(), strict=True):
+            x, y = zip(*curve, strict=True)
+            axes.plot(x, y, marker="o", color="#0072B2")
+            axes.set(title=name, xscale="log")
+            if "norm" in name:
+                axes.set_yscale("log")
+            else:
+                axes.set_ylim(-1.05, 1.05)
+        return shown
+
+
+def main() -> None:
+    """Run the checks, print their tables, and draw the figure."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("checks", nargs="*", metavar="CHECK", help=f"out of {', '.join(CHECKS)} [default: all]")
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--num-samples", type=int, default=128, help="runs of each seed for the smoothed gradient")
+    parser.add_argument("--fresh", type=int, default=20, help="fresh seeds on which steps are judged")
+    parser.add_argument("--output", type=Path, help="figure")
+    parser.add_argument("parameters", nargs="*", help="after --: parameters, as `fleetjax run` takes them")
+    words = sys.argv[1:]
+    cut = words.index("--") if "--" in words else len(words)
+    args = parser.parse_args(words[:cut])
+    for name in args.checks:
+        if name not in CHECKS:
+            parser.error(f"{name}: choose out of {', '.join(CHECKS)}")
+    given = {name: value for name, value in vars(flags.parse(["run", *words[cut + 1 :]])).items() if name in FIELDS_OF_A_RUN}
+    config = fleetjax.make_config("navigation", "weighted", **FLEET | given)
+    keys, wanted, curves = jax.random.split(jax.random.key(0), args.seeds), args.checks or CHECKS, {}
+
+    def show(title: str, table: Table) -> None:
+        print(f"{title}\n\n{text.markdown_table(table)}\n", flush=True)
+
+    if "differences" in wanted:
+        show("Relaxed gradients and finite differences", check_differences(config, keys))
+    if {"temperature", "steps"} & set(wanted):
+        found = jax.jit(lambda keys: fleetjax.sensitivity(config, keys, FIELDS, num_samples=args.num_samples))(keys)
+        reference = relative(config, found)
+        errors = [float(found.standard_error[name] * get_value(config, name)) for name in FIELDS]
+        table = [(f, f"{x:.3f}", f"{e:.3f}") for f, x, e in zip(FIELDS, reference, errors, strict=True)]
+        show("Smoothed gradient", [("by the logarithm of", "gradient", "standard error"), *table])
+    if "temperature" in wanted:
+        table, curves["cosine with the smoothed gradient, by temperature"] = by_temperature(config, keys, reference)
+        show("Relaxed and smoothed gradients", table)
+    if "steps" in wanted:
+        directions = {"the smoothed gradient": reference, "the one against it": -reference}
+        for temperature in (TEMPERATURES[0], TEMPERATURES[2]):
+            slopes = relative(config, relaxed(config.replace(temperature=temperature), keys))
+            directions[f"the relaxed one, temperature {temperature:g}"] = slopes
+        show("Steps", check_steps(config, directions, range(1000, 1000 + args.fresh)))
+    if "length" in wanted:
+        table, curves["norm of the relaxed gradient, by timesteps"] = by_length(config, keys)
+        show("Length", table)
+    if args.output and curves:
+        files.write(args.output, figure.render(draw(curves)))
+        print(args.output)
+
+
+if __name__ == "__main__":
+    main()

@@ -98,11 +98,17 @@ def by_temperature(config: Config, keys: jax.Array, reference: np.ndarray) -> tu
     for temperature in TEMPERATURES:
         each = np.array([relative(config, relaxed(config.replace(temperature=temperature), key[None])) for key in keys])
         mean = each.mean(axis=0)
-        alone = [cosine(one, reference) for one in each]
+        alone = [angle for one in each if not np.isnan(angle := cosine(one, reference))]
         curve.append((temperature, cosine(mean, reference)))
         signs = f"{np.sum(np.sign(mean) == np.sign(reference))} of {len(FIELDS)}"
         rows.append(
-            (f"{temperature:g}", f"{curve[-1][1]:.2f}", signs, f"{np.nanmedian(alone):.2f}", f"{np.linalg.norm(mean):.2g}")
+            (
+                f"{temperature:g}",
+                f"{curve[-1][1]:.2f}",
+                signs,
+                f"{np.median(alone):.2f}" if alone else "-",
+                f"{np.linalg.norm(mean):.2g}",
+            )
         )
     return rows, curve
 
@@ -123,11 +129,11 @@ def check_steps(config: Config, directions: dict[str, np.ndarray], seeds: Sequen
     return rows
 
 
-def by_length(config: Config, keys: jax.Array) -> tuple[Table, list[tuple[int, float]]]:
+def by_length(config: Config, keys: jax.Array, lengths: Sequence[int]) -> tuple[Table, list[tuple[int, float]]]:
     """Return how the norms of relaxed gradients grow with the length of the run."""
     rows: Table = [("timesteps", "median norm", "largest norm")]
     curve = []
-    for length in LENGTHS:
+    for length in lengths:
         longer = config.replace(num_steps=length, temperature=TEMPERATURES[1])
         norms = [np.linalg.norm(relative(config, relaxed(longer, key[None]))) for key in keys]
         curve.append((length, float(np.median(norms))))
@@ -157,6 +163,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--num-samples", type=int, default=128, help="runs of each seed for the smoothed gradient")
     parser.add_argument("--fresh", type=int, default=20, help="fresh seeds on which steps are judged")
+    parser.add_argument("--lengths", type=int, nargs="+", default=LENGTHS, help="timesteps")
     parser.add_argument("--output", type=Path, help="figure")
     parser.add_argument("parameters", nargs="*", help="after --: parameters, as `fleetjax run` takes them")
     words = sys.argv[1:]
@@ -168,6 +175,7 @@ def main() -> None:
     given = {name: value for name, value in vars(flags.parse(["run", *words[cut + 1 :]])).items() if name in FIELDS_OF_A_RUN}
     config = fleetjax.make_config("navigation", "weighted", **FLEET | given)
     keys, wanted, curves = jax.random.split(jax.random.key(0), args.seeds), args.checks or CHECKS, {}
+    reference = np.zeros(len(FIELDS))
 
     def show(title: str, table: Table) -> None:
         print(f"{title}\n\n{text.markdown_table(table)}\n", flush=True)
@@ -190,7 +198,7 @@ def main() -> None:
             directions[f"the relaxed one, temperature {temperature:g}"] = slopes
         show("Steps", check_steps(config, directions, range(1000, 1000 + args.fresh)))
     if "length" in wanted:
-        table, curves["norm of the relaxed gradient, by timesteps"] = by_length(config, keys)
+        table, curves["norm of the relaxed gradient, by timesteps"] = by_length(config, keys, args.lengths)
         show("Length", table)
     if args.output and curves:
         files.write(args.output, figure.render(draw(curves)))

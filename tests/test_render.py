@@ -82,14 +82,14 @@ def test_a_film_is_that_of_the_run():
 
 
 def test_pictures_from_above_are_framed():
-    """Blue under teleoperation, red in violation; the picture itself stays."""
+    """Blue under teleoperation, red in violation, else white; the picture itself stays."""
     pictures = np.full((1, 4, 80, 80, 3), 200, np.uint8)
     marks = np.array([[False, True, False, True]]), np.array([[False, False, True, True]])
     (grid,) = render.draw(render.Film((pictures,), *marks), None, width=40, every=1)
     assert grid.shape == (80, 80, 3)
     corners = [grid[0, 0], grid[0, 40], grid[40, 0], grid[40, 40]]
     red, blue = (np.round(255 * np.array(colour)) for colour in (render.VIOLATING, render.TELEOPERATED))
-    np.testing.assert_array_equal(corners, [[200] * 3, red, blue, red])
+    np.testing.assert_array_equal(corners, [[255] * 3, red, blue, red])
     np.testing.assert_array_equal(grid[20, 60], [200] * 3)
 
 
@@ -162,8 +162,8 @@ def test_a_notebook_shows_the_robots_of_a_run(tmp_path):
     config = fleetjax.make_config("navigation", "expert", num_robots=3, num_humans=3, num_steps=6)
     shown = fleetjax.animate(config, jax.random.key(0), num_shown=2, every=2, width=40)
     shown.save(tmp_path / "film.gif")
-    picture = Image.open(tmp_path / "film.gif")
-    assert (picture.n_frames, picture.width) == (3, 2 * 40)
+    with Image.open(tmp_path / "film.gif") as picture:
+        assert (picture.n_frames, picture.width) == (3, 2 * 40)
     assert shown._repr_html_().startswith('<img alt="animated robots" src="data:image/gif;base64,R0lGOD')
     with pytest.raises(ValueError, match="every = 0"):
         fleetjax.animate(config, jax.random.key(0), every=0)

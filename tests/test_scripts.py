@@ -137,6 +137,17 @@ CASES = {
         (row("Random", "2", r"[\d.]+", r"[\d.]+ to [\d.]+"), row("Expert", "1", r"[\d.]+", "-"), r"^looks/first_look\.png$"),
         ("looks/first_look.png", "alone/first_look.png", "looks/navigation-random-1/policy.msgpack"),
     ),
+    "experiments/gradient_check.py": Case(
+        (f"--seeds 1 --num-samples 2 --fresh 2 --lengths 2 5 --output check.png -- {FLEET} --num-steps 4",),
+        (
+            row("none", r"\d+", r".+", r".+"),
+            row("risk_weight", r"-?[\d.]+", r"(nan|[\d.]+)"),
+            row("0.01", r"-?[\w.]+", r"\d of 5"),
+            row("the smoothed gradient", r"[\d.]+", r"[\d.]+", r"-?[\d.]+", r"-?[\d.]+ to -?[\d.]+"),
+            row("5", r"\S+", r"\S+"),
+        ),
+        ("check.png",),
+    ),
     "experiments/human_time.py": Case(
         ("run-0 run-1",),
         (r"^run-1: \d+ of 80 human timesteps, [\d.]+ %$", r"^mean \d+; .* random_threshold 0\.\d{5}$"),

@@ -21,7 +21,7 @@ class Animation:
         gif: content of a GIF file.
     """
 
-    gif: bytes
+    gif: bytes = dataclasses.field(repr=False)
 
     def save(self, path: str | Path) -> None:
         """Write the GIF file."""

@@ -63,6 +63,13 @@ def style() -> contextlib.AbstractContextManager[None]:
     return mpl.rc_context(_STYLE)
 
 
+class Picture(Figure):
+    """A figure that notebooks show."""
+
+    def _repr_png_(self) -> bytes:
+        return render(self)
+
+
 class Curves(NamedTuple):
     """What is drawn as one line.
 
@@ -129,7 +136,7 @@ def draw(groups: Sequence[Curves], title: str = "") -> Figure:
     """
     with style():
         places = list(dict.fromkeys(curves.environment for curves in groups))
-        figure = Figure(figsize=(12.5, 0.5 + 2.6 * len(places)), layout=ConstrainedLayoutEngine(w_pad=0.12))
+        figure = Picture(figsize=(12.5, 0.5 + 2.6 * len(places)), layout=ConstrainedLayoutEngine(w_pad=0.12))
         axes = figure.subplots(len(places), len(PANELS), squeeze=False)
         numbers = {len(curves.values) for curves in groups}
         legend: dict[str, Line2D] = {}

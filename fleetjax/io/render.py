@@ -24,7 +24,7 @@ from fleetjax.types import EnvState
 
 FORMATS = (".gif", ".mp4")
 CAMERA = "track"  # that every model has
-TELEOPERATED, VIOLATING = (0.1, 0.45, 0.9), (0.9, 0.25, 0.1)  # red, green, blue
+TELEOPERATED, VIOLATING, WHITE = (0.1, 0.45, 0.9), (0.9, 0.25, 0.1), (1.0, 1.0, 1.0)  # red, green, blue
 NEED_GL = (
     "no OpenGL library for drawing without a screen; install one of Debian's packages libegl1 (with libgl1-mesa-dri) or "
     "libosmesa6, or what your system calls them"
@@ -125,16 +125,15 @@ def draw(film: Film, scene: envs.Scene | None, *, width: int, every: int) -> Ite
 
 
 def _frame(width: int) -> Callable[..., np.ndarray]:
-    """Return a function from a picture from above and the robot's two marks to a tile, framed in the colour of its mark."""
+    """Return a function from a picture from above and the robot's two marks to a tile, in a frame of its mark's colour."""
     from PIL import Image
 
     def paint(picture: np.ndarray, violating: bool, teleoperated: bool) -> np.ndarray:
-        tile = np.array(Image.fromarray(picture).resize((width, width)))
-        if violating or teleoperated:
-            edge = max(1, width // 40)
-            inner = tile[edge:-edge, edge:-edge].copy()
-            tile[:] = np.round(255 * np.array(VIOLATING if violating else TELEOPERATED)).astype(np.uint8)
-            tile[edge:-edge, edge:-edge] = inner
+        picture = np.array(Image.fromarray(picture).resize((width, width)))
+        colour = VIOLATING if violating else TELEOPERATED if teleoperated else WHITE
+        edge = max(1, width // (80 if colour is WHITE else 40))
+        tile = np.tile(np.round(255 * np.array(colour)).astype(np.uint8), (width, width, 1))
+        tile[edge:-edge, edge:-edge] = picture[edge:-edge, edge:-edge]
         return tile
 
     return paint

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 from fleetjax.registry import Registry
 
-# Human timesteps, hard resets included, that C.U.R. asked for in a run with default settings; the `constraint` baseline gets
-# as many extra demonstrations. Means of three seeds (block_push, navigation, allegro_hand), two (humanoid) and one (anymal), measured by
-# `python experiments/human_time.py RUN...`, which also prints the `random_threshold` that asks for as much.
+# Human timesteps, hard resets included, that C.U.R. asked for in a run with default settings; the `constraint` baseline gets as
+# many extra demonstrations. Means of three seeds (block_push, navigation, allegro_hand), two (humanoid) and one (anymal),
+# measured by `python experiments/human_time.py RUN...`, which also prints the `random_threshold` that asks for as much.
 CUR_HUMAN_TIME: dict[str, int] = {
     "allegro_hand": 20996,
     "anymal": 10618,

@@ -13,8 +13,8 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from fleetjax import metrics, priority, supervisors
-from fleetjax.allocation import Allocator, helper_of, soft_top_k
+from fleetjax import metrics, priority, soft, supervisors
+from fleetjax.allocation import Allocator, helper_of
 from fleetjax.config import Config
 from fleetjax.envs import Env
 from fleetjax.keys import Keys, split_keys
@@ -172,16 +172,8 @@ def plan(parts: Parts, state: FleetState, keys: Keys, available: jax.Array | Non
     helped = helper_of(humans, config.num_robots) >= 0
     resetting, teleoperated = helped & signals.violation, helped & ~signals.violation
     humans = restart_clocks(humans, state.resetting, resetting, config.hard_reset_time)
-    weight = None if state.weight is None else share(parts, state, score, min_time)
+    weight = None if state.weight is None else soft.share(config, state.humans, state.weight, score, min_time)
     return state._replace(priority=memory), Plan(signals, signals.robot_action, score, humans, teleoperated, resetting, weight)
-
-
-def share(parts: Parts, state: FleetState, score: jax.Array, min_time: jax.Array) -> jax.Array:
-    """Return f32[N], how much of a human each robot gets in the soft allocation: what it had, if its human is bound to it."""
-    helper = helper_of(state.humans, parts.config.num_robots)
-    bound = (helper >= 0) & (state.humans.duration[helper] < min_time)
-    free = parts.config.num_humans - jnp.sum(bound)
-    return jnp.where(bound, state.weight, soft_top_k(jnp.where(bound, 0.0, score), free, parts.config.temperature))
 
 
 def act(
@@ -190,7 +182,10 @@ def act(
     """Do what was planned; return also the robots' states after their step, before resets and new goals."""
     chex.assert_shape(human_action, (parts.config.num_robots, parts.env.spec.action_size))
     given, moving = given & planned.teleoperated, ~state.env.violation
-    action = blend(planned, human_action, given)
+    if planned.weight is None:
+        action = jnp.where(given[:, None], human_action, planned.robot_action)
+    else:
+        action = soft.blend(planned, human_action)
     stepped, sound = step_robots(parts, state.env, action, moving, keys)
     steps = Step(state.env.obs, action, stepped.obs, stepped.violation, stepped.success, planned.robot_action, given)
     humans = planned.humans._replace(duration=jnp.where(planned.humans.robot >= 0, planned.humans.duration + 1, 0))
@@ -210,28 +205,9 @@ def act(
     dropped = state.human_data.dropped - jnp.where(before.timestep > 0, before.human_data.dropped, 0)
     learnt = (reset_done, dropped, find_divergence(state), loss)
     counts = metrics.measure(parts.config, planned, before.humans, stepped, moving, *learnt)
-    return state, counts if planned.weight is None else relax(parts, counts, planned.weight, stepped, moving), stepped
-
-
-def blend(planned: Plan, human_action: jax.Array, given: jax.Array) -> jax.Array:
-    """Return f32[N, A] what robots do: what a human gave them, or their policy; a mixture in the soft allocation."""
-    if planned.weight is None:
-        return jnp.where(given[:, None], human_action, planned.robot_action)
-    return planned.robot_action + planned.weight[:, None] * (human_action - planned.robot_action)
-
-
-def relax(parts: Parts, counts: Metrics, weight: jax.Array, stepped: EnvState, moving: jax.Array) -> Metrics:
-    """Return the metrics of the soft allocation: human time by weights f32[N], successes by sigmoids of their margins."""
-    env, config = parts.env, parts.config
-    if env.success_margin:
-        margin = jax.vmap(env.success_margin)(stepped)
-        judged = moving & ~stepped.violation
-    else:  # by returns, at the end of an episode
-        margin = (stepped.episode_return - config.success_return) / jnp.maximum(jnp.abs(config.success_return), 1.0)
-        judged = moving & stepped.timeout
-    reached = jnp.where(judged, jax.nn.sigmoid(margin / config.temperature), 0.0)
-    teleoperated = jnp.where(moving, weight, 0.0)
-    return counts._replace(successes=jnp.sum(reached), human_steps=jnp.sum(weight), teleop_steps=jnp.sum(teleoperated))
+    if planned.weight is not None:
+        counts = soft.relax(parts.config, parts.env, counts, planned.weight, stepped, moving)
+    return state, counts, stepped
 
 
 def observe(parts: Parts, state: FleetState, keys: Keys) -> Signals:

@@ -1,6 +1,6 @@
 """Ascent along `fleetjax.sensitivity`: tune thresholds, weights and rates of a fleet."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -74,26 +74,48 @@ def tune(
             raise ValueError(f"{name} = {value} cannot be tuned: only real numbers other than 0 can; choose a first value")
     derive = make_gradient(config, env, objective or final_return, names, method, request.widths, num_samples)
     states = jax.lax.map(lambda key: prepare(config, key, env), request.keys)
+
+    def gradient(ratios: Values, number: jax.Array) -> tuple[jax.Array, Values]:
+        values = {name: ratios[name] * start[name] for name in names}
+        worth, slopes, _ = jax.lax.map(
+            lambda entry: derive(values, jax.random.fold_in(entry[0], number), entry[1]), (request.keys, states)
+        )
+        return jnp.mean(worth), {name: jnp.mean(slopes[name]) * start[name] for name in names}
+
+    def within(ratios: Values) -> Values:
+        return {n: jnp.clip(ratios[n] * start[n], known[n].low, known[n].high) / start[n] for n in names}
+
+    ratios, worth = _climb(gradient, within, {name: jnp.ones(()) for name in names}, learning_rate, steps)
+    values = {name: start[name] * ratios[name] for name in names}
+    last = {name: jnp.mean(found[1 + steps // 2 :]) for name, found in values.items()}
+    return Tuned(config.replace(**last), values, worth)
+
+
+def _climb(
+    gradient: Callable[[Values, jax.Array], tuple[jax.Array, Values]],
+    within: Callable[[Values], Values],
+    start: Values,
+    learning_rate: float,
+    steps: int,
+) -> tuple[Values, jax.Array]:
+    """Return what Adam comes to: f32[steps + 1] by name from `start` on, and the objective f32[steps] before each step.
+
+    Args:
+        gradient: `(values, number of the step) -> (objective, gradient)`.
+        within: brings values back into their ranges.
+        start: first values.
+        learning_rate: of Adam.
+        steps: number of steps.
+    """
     optimizer = optax.adam(learning_rate)
 
     def step(carry: tuple[Values, optax.OptState], number: jax.Array):
-        ratios, memory = carry
-        values = {name: ratios[name] * start[name] for name in names}
-
-        def of_key(entry):
-            key, state = entry
-            return derive(values, jax.random.fold_in(key, number), state)
-
-        worth, gradients, _ = jax.lax.map(of_key, (request.keys, states))
-        downhill = {name: -jnp.mean(gradients[name]) * start[name] for name in names}
+        values, memory = carry
+        worth, slopes = gradient(values, number)
         with jax.numpy_dtype_promotion("standard"):  # optax multiplies its i32 count and floats, which "strict" forbids
-            change, memory = optimizer.update(downhill, memory)
-        moved = jax.tree.map(jnp.add, ratios, change)
-        kept = {n: jnp.clip(moved[n] * start[n], known[n].low, known[n].high) / start[n] for n in names}
-        return (kept, memory), (kept, jnp.mean(worth))
+            change, memory = optimizer.update(jax.tree.map(jnp.negative, slopes), memory)
+        values = within(jax.tree.map(jnp.add, values, change))
+        return (values, memory), (values, worth)
 
-    ones = {name: jnp.ones(()) for name in names}
-    _, (ratios, worth) = jax.lax.scan(step, (ones, optimizer.init(ones)), jnp.arange(steps))
-    values = {name: start[name] * jnp.concatenate([jnp.ones(1), ratios[name]]) for name in names}
-    last = {name: jnp.mean(found[1 + steps // 2 :]) for name, found in values.items()}
-    return Tuned(config.replace(**last), values, worth)
+    _, (path, worth) = jax.lax.scan(step, (start, optimizer.init(start)), jnp.arange(steps))
+    return jax.tree.map(lambda first, later: jnp.concatenate([first[None], later]), start, path), worth

@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 
 import fleetjax
 from fleetjax import checks, gradients
-from fleetjax.allocation import soft_top_k
 from fleetjax.config import get_value
 from fleetjax.experiment import scan_in_blocks
 from fleetjax.priority import get_algorithm
+from fleetjax.soft import soft_top_k
 
 TINY = {
     "num_robots": 5,

@@ -1,16 +1,17 @@
-"""Check the gradients of `fleetjax.sensitivity` against each other, and against what they promise.
+"""Check the gradients of `fleetjax.sensitivity` against each other, and against what the docs claim.
 
     python experiments/gradient_check.py [CHECK ...] [--seeds 10] [--num-samples 128] [--output FIGURE.png] [-- PARAMETERS]
 
 The checks, each a table:
 
 - `differences`: the relaxed gradient against finite differences of the same objective, one field and seed at a time, where
-  no hard event (a fall, a reset, a change of who helps whom) lies between the two runs, and where one does.
+  no hard event (a violation, a reset, a change of who helps whom) lies between the two runs, and where one does.
 - `temperature`: relaxed gradients, as the temperature falls, against the smoothed gradient of the hard objective.
 - `steps`: how much a step along each gradient raises the return of the hard fleet on fresh seeds.
 - `length`: how large the relaxed gradient grows with the length of the run.
 
-Gradients are by the logarithm of each field, so that fields of different size compare. PARAMETERS are those of `fleetjax run`.
+Gradients are with respect to the logarithm of each field, so that fields of different size compare. PARAMETERS are those
+of `fleetjax run`.
 """
 
 import argparse
@@ -70,8 +71,9 @@ def check_differences(config: Config, keys: jax.Array) -> Table:
 
     @jax.jit
     def run(config: Config, key: jax.Array, state: fleetjax.FleetState) -> tuple[jax.Array, list[jax.Array]]:
-        metrics = fleetjax.run(config, key, state).metrics
-        return fleetjax.rohe(metrics, config)[-1], [getattr(metrics, name) for name in EVENTS]
+        metrics, last = fleetjax.run(config, key, state)
+        counts = [getattr(metrics, name) for name in EVENTS]
+        return fleetjax.rohe(metrics, config)[-1], [*counts, last.env.episode_step, last.humans.robot]
 
     errors: dict[bool, list[float]] = {False: [], True: []}
     for key in keys:
@@ -192,7 +194,7 @@ def main() -> None:
         table, curves["cosine with the smoothed gradient, by temperature"] = by_temperature(config, keys, reference)
         show("Relaxed and smoothed gradients", table)
     if "steps" in wanted:
-        directions = {"the smoothed gradient": reference, "the one against it": -reference}
+        directions = {"the smoothed gradient": reference, "the opposite direction": -reference}
         for temperature in (TEMPERATURES[0], TEMPERATURES[2]):
             slopes = relative(config, relaxed(config.replace(temperature=temperature), keys))
             directions[f"the relaxed one, temperature {temperature:g}"] = slopes

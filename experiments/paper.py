@@ -24,7 +24,7 @@ from fleetjax.io.study import Study, make_study, plan
 from fleetjax.priority import get_algorithm
 
 HERE = Path(__file__).parent
-PARTS = ("main", "gradient_steps", "policies", "ablations", "humans", "times", "equal_budget")  # in this order
+PARTS = ("main", "gradient_steps", "policies", "ablations", "humans", "times")  # in this order
 TRAINED = "main"  # the part whose policies are evaluated
 METRICS = {
     "main": ("successes", "violations", "idle", "rohe", "rohe_with_demonstrations"),
@@ -116,13 +116,13 @@ class Part:
 def main() -> None:
     """Run the parts that are asked for, then show what they gave."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", metavar="PART", help=f"out of {', '.join(PARTS)} [default: all]")
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"one or more of {', '.join(PARTS)} [default: all]")
     parser.add_argument("--studies", type=Path, default=HERE / "studies", help="folder of the parts' files")
-    parser.add_argument("--seeds", type=int, help="in place of those in the file")
+    parser.add_argument("--seeds", type=int, help="number of seeds, instead of the file's")
     parser.add_argument("--workers", type=int, help="processes [default: one for each core]")
     parser.add_argument("--output", type=Path, default=Path("runs/paper"), help="folder for the run folders")
     parser.add_argument("--results", type=Path, default=HERE / "results", help="folder for rows, tables and figures")
-    parser.add_argument("--rows-only", action="store_true", help="do not run anything")
+    parser.add_argument("--rows-only", action="store_true", help="no runs; only tables and figures")
     args = parser.parse_args()
     for name in args.parts:
         if name not in PARTS:

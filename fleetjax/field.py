@@ -89,7 +89,7 @@ class Fields:
     )
     risk_threshold: float = _traced(0.5, "robots below this risk count as safe", high=1)
     temperature: float = _traced(
-        0.1, "how far the soft allocation is from the hard one, in units of scores; the hard one is its limit for 0"
+        0.1, "how soft the soft allocation is: the width of its sigmoids, in units of scores, and of tolerances of success"
     )
     learning_rate: float = _traced(3e-4, "Adam's learning rate, policy and critics")
     normalize_observations: bool = _traced(
@@ -108,6 +108,17 @@ class Fields:
 
 
 FIELDS: dict[str, Field] = {f.name: f.metadata["field"] for f in dataclasses.fields(Fields)}
+
+# What acts only before the fleet starts.
+OFFLINE = (
+    "num_demonstrations",
+    "extra_demonstrations",
+    "pretraining_steps",
+    "critic_pretraining_steps",
+    "num_critic_transitions",
+    "critic_noise",
+    "normalize_observations",
+)
 
 # The orders of C, U and R, such as C.U.R.
 ORDERS = tuple("".join(letters) for size in (3, 2, 1) for letters in itertools.permutations("cur", size))

@@ -81,6 +81,7 @@ class Parts(NamedTuple):
     env: Env
     algorithm: Algorithm
     rule: Priority
+    binding: Priority  # by whose scores humans are assigned: the rule, as it is in a hard fleet
     allocate: Allocator
     supervisor: Supervisor
     learner: Learner
@@ -113,7 +114,8 @@ def make_parts(config: Config, env: Env) -> Parts:
     learnt = priority.estimators_of(algorithm, env.spec)
     estimators = {name: ESTIMATORS.get(name)(config, env, learner, supervisor) for name in learnt}
     rule, allocator = algorithm.make_priority(config), algorithm.make_allocate(config)
-    return Parts(config, env, algorithm, rule, allocator, supervisor, learner, estimators)
+    binding = algorithm.make_priority(config.replace(allocation="hard")) if config.allocation == "soft" else rule
+    return Parts(config, env, algorithm, rule, binding, allocator, supervisor, learner, estimators)
 
 
 def make_fleet(config: Config, env: Env) -> Fleet:
@@ -168,7 +170,8 @@ def plan(parts: Parts, state: FleetState, keys: Keys, available: jax.Array | Non
     signals = observe(parts, state, keys)
     score, memory = parts.rule.score(signals, state.priority, keys.score)
     min_time = jnp.where(state.resetting, config.hard_reset_time, config.min_teleop_time)
-    humans = parts.allocate(score, state.humans, min_time, keys.ties, available, signals)
+    binding = score if state.weight is None else parts.binding.score(signals, state.priority, keys.score)[0]
+    humans = parts.allocate(binding, state.humans, min_time, keys.ties, available, signals)
     helped = helper_of(humans, config.num_robots) >= 0
     resetting, teleoperated = helped & signals.violation, helped & ~signals.violation
     humans = restart_clocks(humans, state.resetting, resetting, config.hard_reset_time)

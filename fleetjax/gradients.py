@@ -1,4 +1,4 @@
-"""How much more a fleet is worth if a parameter changes: gradients by perturbed runs, by a relaxed fleet, or forwards.
+"""How much more a fleet is worth if a parameter changes: gradients from shifted runs, a relaxed fleet, or forward mode.
 
 A fleet decides by thresholds, ranks and resets, so the derivative of one run is not that of the mean over runs. `smoothed` is
 unbiased for the mean over Gaussian perturbations, whatever the fleet does. `relaxed` and `forward` differentiate through the
@@ -21,7 +21,7 @@ from fleetjax import checks
 from fleetjax.config import Config, all_fields, get_value
 from fleetjax.envs import Env
 from fleetjax.experiment import prepare, run, step_once
-from fleetjax.field import Field
+from fleetjax.field import OFFLINE, Field
 from fleetjax.fleet import FleetState
 from fleetjax.metrics import Metrics, rohe
 from fleetjax.precision import in_32_bits
@@ -29,7 +29,8 @@ from fleetjax.registry import unknown
 
 METHODS = ("smoothed", "relaxed", "forward")
 WIDTH = 0.1  # deviation of perturbations, in units of a field's value
-_NOISE = 2**32 - 1  # folded into a run's key for the noise; `keys.key_at` folds in timesteps
+STEPS, _NOISE = 2**32 - 2, 2**32 - 1  # folded into a run's key for tuning and for noise; `keys.key_at` folds in timesteps
+_SMALLEST = 1e-6  # to which positive fields are shifted at most: some are divided by
 Objective = Callable[[Metrics, Config], jax.Array]
 Values = dict[str, jax.Array]
 
@@ -40,7 +41,7 @@ class Sensitivity(NamedTuple):
     Attributes:
         value: f32[] the objective.
         gradient: f32[] by field, its derivative.
-        standard_error: f32[] by field, of that; NaN where one key has one sample.
+        standard_error: f32[] by field, of the gradient; NaN for one key, unless `"smoothed"` has more than two samples.
     """
 
     value: jax.Array
@@ -71,15 +72,15 @@ def sensitivity(
 
     Args:
         config: configuration.
-        keys: random key, or keys [S]. One run of each key takes the place of a sample of fleets.
+        keys: random key, or keys [S]. Results are means over them.
         fields: names of traced fields, or of parameters of the algorithm.
         objective: `(Metrics[T], config) -> f32[]`; by default the return on human effort at the end.
         method: `"smoothed"`: differences between runs whose fields are shifted up and down by the same Gaussian noise. Works
             everywhere. `"relaxed"`: reverse mode through the run with `allocation = "soft"`. For environments in plain JAX, and
             algorithms with differentiable scores such as `weighted`. `"forward"`: forward mode through the run as configured,
             one field after the other. For environments on MJX, too.
-        width: of the noise in `"smoothed"`, its standard deviation: a number in units of each field's value (0.1 if None),
-            or a mapping from fields to widths. Shifted values beyond a field's range count as its bound.
+        width: of the noise in `"smoothed"`, its standard deviation: a fraction of each field's value (0.1 if None), or a
+            mapping from fields to widths themselves. Shifted values beyond a field's range count as its bound.
         num_samples: shifted runs for each key in `"smoothed"`, an even number.
         env: the environment, if it is not the registered one that the configuration names.
 
@@ -106,7 +107,7 @@ def sensitivity(
         {name: jnp.mean(gradients[name]) for name in names},
         {name: _standard_error(gradients[name], variances[name]) for name in names},
     )
-    _warn_of_zeros(found, method)
+    _warn_of_zeros(found, hard=method == "forward" and config.allocation == "hard")
     return found
 
 
@@ -164,14 +165,19 @@ def make_gradient(
 
     def objective(values: Values, key: jax.Array, state: FleetState) -> jax.Array:
         changed = config.replace(**values)
-        return worth(run(changed, key, state, env).metrics, changed)
+        value = jnp.asarray(worth(run(changed, key, state, env).metrics, changed))
+        if value.ndim:
+            raise ValueError(f"objective returned an array of shape {value.shape}; it must return one number")
+        return value.astype(jnp.float32)
 
     def smoothed(values: Values, key: jax.Array, state: FleetState) -> tuple[jax.Array, Values, Values]:
         known = all_fields(config.algorithm)
         noise = jax.random.normal(jax.random.fold_in(key, _NOISE), (num_samples // 2, len(names)))
 
         def shifted(z: jax.Array, sign: int) -> jax.Array:
-            moved = {n: _within(known[n], values[n].astype(jnp.float32) + sign * widths[n] * z[i]) for i, n in enumerate(names)}
+            moved = {
+                n: within_range(known[n], values[n].astype(jnp.float32) + sign * widths[n] * z[i]) for i, n in enumerate(names)
+            }
             return objective(moved, key, state)
 
         rises = jax.lax.map(lambda z: (shifted(z, 1) - shifted(z, -1)) / 2, noise)
@@ -186,18 +192,21 @@ def make_gradient(
         return value, gradient, jax.tree.map(jnp.zeros_like, gradient)
 
     def forward(values: Values, key: jax.Array, state: FleetState) -> tuple[jax.Array, Values, Values]:
-        value, push = jax.linearize(lambda values: objective(values, key, state), values)
-        zeros = jax.tree.map(jnp.zeros_like, values)
-        gradient = {name: push(zeros | {name: jnp.ones_like(values[name])}) for name in names}
-        return value, gradient, zeros
+        def along(direction: jax.Array) -> tuple[jax.Array, jax.Array]:
+            tangent = {name: direction[i] for i, name in enumerate(names)}
+            return jax.jvp(lambda values: objective(values, key, state), (values,), (tangent,))
+
+        value, slopes = jax.lax.map(along, jnp.eye(len(names)))
+        return value[0], {name: slopes[i] for i, name in enumerate(names)}, jax.tree.map(jnp.zeros_like, values)
 
     return {"smoothed": smoothed, "relaxed": relaxed, "forward": forward}[method]
 
 
-def _within(field: Field, value: jax.Array) -> jax.Array:
+def within_range(field: Field, value: jax.Array) -> jax.Array:
     """Return a value as a field can hold it: within its range, and whole if need be."""
-    value = jnp.clip(value, field.low, field.high)
-    return jnp.round(value).astype(jnp.int32) if field.kind is int else value
+    if field.kind is int:
+        return jnp.round(jnp.clip(value, field.low, field.high)).astype(jnp.int32)
+    return jnp.clip(value, _SMALLEST if field.low == 0 else field.low, field.high)
 
 
 def _standard_error(gradients: jax.Array, variances: jax.Array) -> jax.Array:
@@ -226,8 +235,10 @@ def _check_fields(config: Config, names: Sequence[str], method: str) -> None:
         field = known[name]
         if not field.traced or field.kind is bool:
             raise ValueError(f"field {name} is {'static' if not field.traced else 'a switch'}; there is no derivative by it")
+        if name in OFFLINE:
+            raise ValueError(f"field {name} acts only before t = 0, and the fleet at t = 0 is held fixed; omit it")
         if field.kind is int and method != "smoothed":
-            raise ValueError(f"field {name} is a whole number, by which only method = 'smoothed' works, not {method!r}")
+            raise ValueError(f"field {name} is a whole number; use method = 'smoothed', not {method!r}")
 
 
 def _widths(config: Config, names: Sequence[str], width: float | Mapping[str, float] | None) -> Values:
@@ -235,7 +246,7 @@ def _widths(config: Config, names: Sequence[str], width: float | Mapping[str, fl
     given = width if isinstance(width, Mapping) else {}
     unknown_names = set(given) - set(names)
     if unknown_names:
-        raise ValueError(f"width names {', '.join(sorted(unknown_names))}, which is not among fields")
+        raise ValueError(f"width names {', '.join(sorted(unknown_names))}, which fields does not have")
     share = WIDTH if width is None or isinstance(width, Mapping) else width
     widths = {name: given[name] if name in given else share * abs(_concrete(config, name)) for name in names}
     for name, found in widths.items():
@@ -304,9 +315,9 @@ def reverse_bytes(config: Config, env: Env) -> int:
     return checks.count_bytes(state) * (config.num_steps // size + 2) + checks.count_bytes(kept) * size
 
 
-def _warn_of_zeros(found: Sensitivity, method: str) -> None:
+def _warn_of_zeros(found: Sensitivity, *, hard: bool) -> None:
     """Warn of fields on which the objective did not depend, where numbers are known."""
     for name, slope in found.gradient.items():
         if not isinstance(slope, Tracer) and slope == 0:
-            other = "" if method == "smoothed" else "; thresholds and ranks have none in this method: try method = 'smoothed'"
+            other = "; in a hard fleet, thresholds and ranks have no derivative: try method = 'smoothed'" if hard else ""
             warnings.warn(f"the objective did not depend on {name}: its derivative is exactly 0{other}", stacklevel=4)

@@ -1,4 +1,4 @@
-"""The soft fleet: help in shares, of which derivatives exist (`allocation = "soft"`).
+"""The soft fleet: robots get shares of humans, so that derivatives exist (`allocation = "soft"`).
 
 As the temperature falls to 0, it becomes the hard fleet of the paper. What stays hard: violations, resets, the ends of
 episodes, which pairs are stored and drawn, and who is bound to whom.
@@ -52,8 +52,8 @@ def soft_top_k(score: jax.Array, k: jax.Array, temperature: jax.Array | float) -
     """Return f32[N], how much of a human each robot gets, at most `k` in total: a relaxation of the `k` highest scores.
 
     The share of a robot with score s is tanh(s / temperature) sigmoid((s - level) / temperature): 0 for score 0, and about 1
-    well above the level, which is as low as the total permits. As the temperature falls to 0, shares become 1 for the robots
-    that `allocate` helps when all humans are free, and 0 for the others. Robots with equal scores have equal shares.
+    well above the level, the lowest at which the total is at most `k`. As the temperature falls to 0, shares become 1 for
+    the robots that `allocate` helps when all humans are free, and 0 for the others. Robots with equal scores have equal shares.
 
     Args:
         score: f32[N] priority of each robot, >= 0; 0 or NaN = no help.
@@ -61,7 +61,7 @@ def soft_top_k(score: jax.Array, k: jax.Array, temperature: jax.Array | float) -
         temperature: f32[] > 0, in units of scores.
 
     The level is found by bisection. A Newton step at the end, whose value is 0, gives it the derivative that the implicit
-    function theorem says, in both modes of differentiation.
+    function theorem gives, in both modes of differentiation.
     """
     score = jnp.where(score > 0, score, 0.0)  # a NaN is not > 0
     k, temperature = (jnp.asarray(x, score.dtype) for x in (k, temperature))

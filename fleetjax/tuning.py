@@ -6,11 +6,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
+from jax.core import Tracer
 
 from fleetjax.config import Config, all_fields, get_value
 from fleetjax.envs import Env
 from fleetjax.experiment import prepare
-from fleetjax.gradients import Objective, Values, check_request, final_return, make_gradient
+from fleetjax.gradients import STEPS, Objective, Values, check_request, final_return, make_gradient, within_range
 from fleetjax.precision import in_32_bits
 
 
@@ -65,30 +66,33 @@ def tune(
     Raises:
         ValueError: as `sensitivity`, and if a field is a whole number, or 0.
     """
-    request = check_request(config, keys, fields, method, width, num_samples, env)
+    if steps < 1:
+        raise ValueError(f"steps = {steps} must be at least 1")
+    request, hard = check_request(config, keys, fields, method, width, num_samples, env), config
     config, env, names = request.config, request.env, request.names
     known = all_fields(config.algorithm)
     start = {name: jnp.float32(get_value(config, name)) for name in names}
     for name, value in start.items():
-        if known[name].kind is not float or value == 0:
-            raise ValueError(f"{name} = {value} cannot be tuned: only real numbers other than 0 can; choose a first value")
+        if known[name].kind is not float:
+            raise ValueError(f"{name} is a whole number and cannot be tuned; omit it")
+        if not isinstance(value, Tracer) and value == 0:
+            raise ValueError(f"{name} = 0 cannot be tuned: steps are in units of the first value; start from another one")
     derive = make_gradient(config, env, objective or final_return, names, method, request.widths, num_samples)
     states = jax.lax.map(lambda key: prepare(config, key, env), request.keys)
 
     def gradient(ratios: Values, number: jax.Array) -> tuple[jax.Array, Values]:
         values = {name: ratios[name] * start[name] for name in names}
-        worth, slopes, _ = jax.lax.map(
-            lambda entry: derive(values, jax.random.fold_in(entry[0], number), entry[1]), (request.keys, states)
-        )
+        keys = jax.vmap(lambda key: jax.random.fold_in(jax.random.fold_in(key, STEPS), number))(request.keys)
+        worth, slopes, _ = jax.lax.map(lambda entry: derive(values, *entry), (keys, states))
         return jnp.mean(worth), {name: jnp.mean(slopes[name]) * start[name] for name in names}
 
     def within(ratios: Values) -> Values:
-        return {n: jnp.clip(ratios[n] * start[n], known[n].low, known[n].high) / start[n] for n in names}
+        return {n: within_range(known[n], ratios[n] * start[n]) / start[n] for n in names}
 
     ratios, worth = _climb(gradient, within, {name: jnp.ones(()) for name in names}, learning_rate, steps)
     values = {name: start[name] * ratios[name] for name in names}
     last = {name: jnp.mean(found[1 + steps // 2 :]) for name, found in values.items()}
-    return Tuned(config.replace(**last), values, worth)
+    return Tuned(hard.replace(**last), values, worth)
 
 
 def _climb(

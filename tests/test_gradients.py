@@ -39,6 +39,15 @@ KEYS = jax.random.split(jax.random.key(3), 2)
 SCORES = hnp.arrays(np.float64, 8, elements=st.floats(0, 100), unique=True)
 
 
+@pytest.fixture(autouse=True)
+def quick_compilation():
+    """Compile quickly among the slow tests, too: these programs run for a moment only."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
+
+
 @pytest.fixture(scope="module")
 def config():
     return fleetjax.make_config("navigation", "weighted", **TINY)
@@ -280,6 +289,7 @@ def refused(config, *, fields: Any = "risk_threshold", keys=KEYS, **options):
 def test_bad_requests_are_refused_before_anything_is_computed(config, monkeypatch):
     monkeypatch.setattr(gradients, "prepare", None)
     assert "risk_threshold" in refused(config, fields="risk_treshold")
+    assert "acts only before t = 0" in refused(config, fields="critic_noise")
     assert "num_robots is static" in refused(config, fields="num_robots")
     assert "normalize_observations is a switch" in refused(config, fields="normalize_observations")
     assert "method = 'smoothed'" in refused(config, fields="initial_period", method="relaxed")

@@ -15,7 +15,7 @@ from fleetjax.io import files, render
 
 @dataclasses.dataclass(frozen=True)
 class Animation:
-    """An animation, which a notebook shows where it is the last value of a cell.
+    """An animation that a notebook shows if it is the last value of a cell.
 
     Attributes:
         gif: content of a GIF file.
@@ -34,7 +34,7 @@ class Animation:
 def animate(
     config: Config, key: jax.Array, state: FleetState | None = None, *, num_shown: int = 9, every: int = 2, width: int = 120
 ) -> Animation:
-    """Run a fleet for `config.num_steps` timesteps, and show its first robots: blue if teleoperated, red in violation.
+    """Run `config.num_steps` timesteps of a fleet, and show its first robots: marked blue if teleoperated, red in violation.
 
     Args:
         config: configuration.

@@ -198,6 +198,21 @@ def _gl_context(width: int, height: int) -> Any:
     raise ValueError(NEED_GL)
 
 
+def _sample(images: list[Any]) -> Any:
+    """Return one image with the colours of a film: some of its pictures, and those of the marks."""
+    from PIL import Image
+
+    some = images[:: max(1, len(images) // 6)]
+    width, height = images[0].size
+    sample = Image.new("RGB", (width, height * (len(some) + 1)))
+    for i, image in enumerate(some):
+        sample.paste(image, (0, i * height))
+    marks = [tuple(round(255 * x) for x in colour) for colour in (VIOLATING, TELEOPERATED, WHITE)]
+    for i, colour in enumerate(marks):
+        sample.paste(colour, (i * width // 3, len(some) * height, (i + 1) * width // 3, (len(some) + 1) * height))
+    return sample
+
+
 def encode(pictures: Iterator[np.ndarray], path: Path, *, rate: float) -> bytes:
     """Return a film as the bytes of a gif or an mp4, by the suffix of `path`.
 
@@ -211,7 +226,7 @@ def encode(pictures: Iterator[np.ndarray], path: Path, *, rate: float) -> bytes:
 
         # One palette for all pictures: else the colours flicker.
         first, *others = [Image.fromarray(picture) for picture in pictures]
-        palette = first.quantize(128)
+        palette = _sample([first, *others]).quantize(128)
         frames = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in (first, *others)]
         data = io.BytesIO()
         frames[0].save(data, "gif", save_all=True, append_images=frames[1:], duration=max(20, round(1000 / rate)), loop=0)

@@ -30,5 +30,8 @@ def above(values: jax.Array, threshold: jax.Array) -> jax.Array:
 
 
 def softly_above(values: jax.Array, threshold: jax.Array | float, temperature: jax.Array) -> jax.Array:
-    """Return `values` times a sigmoid that rises from 0 to 1 about `threshold`; for temperature 0 it is `above`."""
+    """Return `values` times a sigmoid that rises from 0 to 1 about `threshold`.
+
+    As the temperature falls to 0, this approaches `above`.
+    """
     return values * jax.nn.sigmoid((values - threshold) / temperature)

@@ -1,4 +1,4 @@
-"""A weighted sum of violation, uncertainty, risk and chance of failure: C.U.R. with weights to differentiate by."""
+"""A weighted sum of violation, uncertainty, risk and chance of failure: C.U.R. as a sum, which has derivatives."""
 
 import jax
 import jax.numpy as jnp
@@ -17,22 +17,24 @@ def weighted(config) -> Priority:
 
     U and R count as 0 below their thresholds, and robots in violation score 0 in the initial period. C.U.R. is the limit for
     w_C / w_U and w_U / w_R to infinity, U.C. that for w_U / w_C to infinity and w_R = 0. With `allocation = "soft"`, U and R
-    rise over their thresholds as sigmoids, whose width is the temperature in units of the threshold.
+    rise over their thresholds as sigmoids, whose width is the temperature, in units of scores.
 
     Reference: paper, Section 4.2, whose order of criteria it relaxes to weights.
     """
     own = config.parameters
     soft = config.allocation == "soft"
 
-    def in_units(values: jax.Array, threshold: jax.Array) -> jax.Array:
-        return softly_above(values / threshold, 1.0, config.temperature) if soft else above(values, threshold) / threshold
+    def part(weight: jax.Array, values: jax.Array, threshold: jax.Array) -> jax.Array:
+        if soft:
+            return softly_above(weight * values / threshold, weight, config.temperature)
+        return weight * above(values, threshold) / threshold
 
     def score(signals, key):
         del key
         total = (
             own["violation_weight"] * signals.violation.astype(signals.uncertainty.dtype)
-            + own["uncertainty_weight"] * in_units(signals.uncertainty, config.uncertainty_threshold)
-            + own["risk_weight"] * in_units(signals.risk, config.risk_threshold)
+            + part(own["uncertainty_weight"], signals.uncertainty, config.uncertainty_threshold)
+            + part(own["risk_weight"], signals.risk, config.risk_threshold)
         )
         if "goal" in (signals.estimates or {}):
             total += own["goal_weight"] * (1.0 - signals.goal)

@@ -108,7 +108,10 @@ class Part:
         against = "cur" if places and len(set(places)) == len(places) else None  # where there is one C.U.R. to compare with
         table = compare(runs, against, METRICS.get(self.name, comparing.METRICS), allow_different=True)
         shown = [run for run in runs if run.config.algorithm != "expert"] or runs  # whose curves would flatten the others
-        for suffix, content in {".md": table.markdown().encode(), ".png": figure.render(plot(shown))}.items():
+        outputs = {".md": table.markdown().encode()}
+        if self.name != "policies":  # which learn nothing, so that their curves are straight
+            outputs[".png"] = figure.render(plot(shown))
+        for suffix, content in outputs.items():
             files.write(self.path.with_suffix(suffix), content)
             print(self.path.with_suffix(suffix))
 

@@ -1,0 +1,40 @@
+"""What is committed of the study: its tables are those of its rows."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from fleetjax.io import rows
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "experiments" / "results"
+PARTS = sorted(path.stem for path in RESULTS.glob("*.csv"))
+
+
+@pytest.fixture(scope="module")
+def remade(tmp_path_factory):
+    """The folder in which tables and figures of all parts were made anew from copies of their rows."""
+    folder = tmp_path_factory.mktemp("results")
+    for part in PARTS:
+        shutil.copy(RESULTS / f"{part}.csv", folder)
+    command = [sys.executable, ROOT / "experiments" / "paper.py", *PARTS, "--rows-only", "--results", folder]
+    subprocess.run(command, check=True, capture_output=True)
+    return folder
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_tables_are_those_of_the_rows(part, remade):
+    assert (remade / f"{part}.md").read_text() == (RESULTS / f"{part}.md").read_text()
+    if part != "policies":
+        assert (remade / f"{part}.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_rows_are_those_of_whole_runs(part):
+    for run in rows.read(RESULTS / f"{part}.csv"):
+        assert run.timesteps[-1] == run.config.num_steps
+        assert run.processor
+        assert run.versions["fleetjax"]

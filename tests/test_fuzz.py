@@ -70,6 +70,7 @@ def values(name: str) -> st.SearchStrategy[Any]:
 CONFIGS = st.fixed_dictionaries({}, optional={name: values(name) for name in FIELDS if name != "environment"})
 
 
+@pytest.mark.slow
 @hypothesis.settings(FEW, max_examples=1000)
 @hypothesis.given(environment=st.sampled_from(fleetjax.list_envs()), fields=CONFIGS)
 def test_a_configuration_is_valid_or_its_error_names_a_field(environment, fields):

@@ -239,6 +239,7 @@ def test_smoothed_gradients_are_those_of_the_mean(config):
         assert 0.5 < found.standard_error[name] / (deviation / 200**0.5) < 2.5
 
 
+@pytest.mark.slow
 def test_whole_numbers_can_be_smoothed(config):
     worth = lambda metrics, config: config.min_teleop_time.astype(jnp.float32) ** 2  # noqa: E731
     found = fleetjax.sensitivity(

@@ -194,6 +194,7 @@ def test_robots_violate_as_often_on_both_backends(name):
     assert abs(one.mean() - other.mean()) < 3 * np.sqrt((one.var() + other.var()) / NUM_ROBOTS)
 
 
+@pytest.mark.slow
 @each_robot_and_backend
 def test_inactive_robots_keep_their_state(name, backend):
     states, controls = mixed(name)

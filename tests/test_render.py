@@ -103,6 +103,7 @@ def test_render_draws_what_has_no_bodies(tmp_path, capsys):
         assert np.asarray(image.convert("RGB"))[0, 0, 2] > 200  # the frame: the expert acts
 
 
+@pytest.mark.slow
 @needs_gl
 def test_render_writes_a_gif(tmp_path, capsys):
     path = tmp_path / "robots.gif"

@@ -25,6 +25,7 @@ def remade(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", PARTS)
 def test_tables_are_those_of_the_rows(part, remade):
     assert (remade / f"{part}.md").read_text() == (RESULTS / f"{part}.md").read_text()

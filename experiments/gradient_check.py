@@ -28,6 +28,7 @@ import fleetjax
 from fleetjax import statistics
 from fleetjax.config import FIELDS as FIELDS_OF_A_RUN
 from fleetjax.config import Config, get_value
+from fleetjax.gradients import final_return
 from fleetjax.io import figure, files, flags, text
 
 FIELDS = ("uncertainty_threshold", "risk_threshold", "violation_weight", "uncertainty_weight", "risk_weight")
@@ -61,7 +62,7 @@ def relaxed(config: Config, keys: jax.Array) -> fleetjax.Sensitivity:
 @jax.jit
 def final_returns(config: Config, keys: jax.Array) -> jax.Array:
     """Return f32[S], the return on human effort of hard runs."""
-    return jax.lax.map(lambda key: fleetjax.rohe(fleetjax.run(config, key).metrics, config)[-1], keys)
+    return jax.lax.map(lambda key: final_return(fleetjax.run(config, key).metrics, config), keys)
 
 
 def check_differences(config: Config, keys: jax.Array) -> Table:
@@ -73,7 +74,7 @@ def check_differences(config: Config, keys: jax.Array) -> Table:
     def run(config: Config, key: jax.Array, state: fleetjax.FleetState) -> tuple[jax.Array, list[jax.Array]]:
         metrics, last = fleetjax.run(config, key, state)
         counts = [getattr(metrics, name) for name in EVENTS]
-        return fleetjax.rohe(metrics, config)[-1], [*counts, last.env.episode_step, last.humans.robot]
+        return final_return(metrics, config), [*counts, last.env.episode_step, last.humans.robot]
 
     errors: dict[bool, list[float]] = {False: [], True: []}
     for key in keys:
@@ -167,7 +168,6 @@ def main() -> None:
     parser.add_argument("--fresh", type=int, default=20, help="fresh seeds on which steps are judged")
     parser.add_argument("--lengths", type=int, nargs="+", default=LENGTHS, help="timesteps")
     parser.add_argument("--output", type=Path, help="figure")
-    parser.add_argument("parameters", nargs="*", help="after --: parameters, as `fleetjax run` takes them")
     words = sys.argv[1:]
     cut = words.index("--") if "--" in words else len(words)
     args = parser.parse_args(words[:cut])

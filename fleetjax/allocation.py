@@ -53,7 +53,7 @@ def allocate(
     nobody = -jnp.ones((), humans.robot.dtype)
 
     assigned = available & (humans.robot >= 0)
-    bound = assigned & (humans.duration < min_time[humans.robot])
+    bound = available & is_bound(humans, min_time)
     unlocked = available & ~bound
 
     competing = jnp.where(score > 0, score, 0.0)  # a NaN is not > 0
@@ -76,6 +76,11 @@ def allocate(
     keeps = bound | stays
     robot = jnp.where(keeps, humans.robot, jnp.where(waiting, queue[turn], nobody))
     return HumanState(robot=robot, duration=jnp.where(keeps, humans.duration, 0))
+
+
+def is_bound(humans: HumanState, min_time: jax.Array) -> jax.Array:
+    """Return bool[M], the humans whose intervention is younger than the minimum time i32[N] of its robot."""
+    return (humans.robot >= 0) & (humans.duration < min_time[humans.robot])
 
 
 def tie_order(key: jax.Array, num_robots: int) -> jax.Array:

@@ -7,7 +7,7 @@ episodes, which pairs are stored and drawn, and who is bound to whom.
 import jax
 import jax.numpy as jnp
 
-from fleetjax.allocation import helper_of
+from fleetjax.allocation import helper_of, is_bound
 from fleetjax.config import Config
 from fleetjax.envs import Env
 from fleetjax.metrics import Metrics
@@ -25,7 +25,7 @@ def share(config: Config, humans: HumanState, weight: jax.Array, score: jax.Arra
         min_time: i32[N] shortest intervention on each robot.
     """
     helper = helper_of(humans, config.num_robots)
-    bound = (helper >= 0) & (humans.duration[helper] < min_time)
+    bound = (helper >= 0) & is_bound(humans, min_time)[helper]
     free = config.num_humans - jnp.sum(bound)
     return jnp.where(bound, weight, soft_top_k(jnp.where(bound, 0.0, score), free, config.temperature))
 

@@ -46,6 +46,7 @@ def test_a_push_moves_the_cube_away_from_its_face_slips_and_turns_it(env, face, 
     np.testing.assert_allclose([after.physics.angle.mean(), after.physics.angle.std()], [0, 0.06], atol=5e-3)
 
 
+@pytest.mark.slow
 def test_faces_turn_with_the_cube_and_look_alike_after_a_quarter(env):
     turned = pushes(env, begun(angle=0.5), UP).physics
     np.testing.assert_allclose(turned.position.mean(axis=0), 0.1275 * np.array([-np.sin(0.5), np.cos(0.5)]), atol=2e-3)

@@ -7,6 +7,7 @@ import toy_envs
 import fleetjax
 from fleetjax import envs
 
+QUICK = ("navigation", "humanoid")  # the others are slow tests
 GOOD = toy_envs.scripted([5, 0, 0, 0], [3, 0, 0, 0], horizon=20, new_goals=True)
 
 
@@ -16,7 +17,9 @@ def toy_supervisors():
         yield
 
 
-@pytest.mark.parametrize("name", fleetjax.list_envs())
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in QUICK)) for name in fleetjax.list_envs()]
+)
 def test_environments_that_ship_pass(name):
     fleetjax.check_env(envs.make(name))
 

@@ -70,6 +70,7 @@ def test_the_same_seed_gives_the_same_files_and_a_table(finished, copied, capsys
         assert (copied / name).read_bytes() == (finished / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_default_folders_are_made_below_runs_and_never_used_again(finished, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(folder.time, "strftime", lambda form: "now")
@@ -102,6 +103,7 @@ def test_ctrl_c_before_the_first_timestep_leaves_nothing(tmp_path):
     assert not (tmp_path / "new" / "run").exists()
 
 
+@pytest.mark.slow
 def test_evaluation_is_the_librarys(copied, capsys):
     assert cli.main(["evaluate", str(copied), "--num-steps", "16", "--seed", "9"]) == 0
     printed = capsys.readouterr()

@@ -585,6 +585,7 @@ def test_ctrl_c_before_the_first_timestep_leaves_nothing(tmp_path, port_of, caps
     assert not path.exists()
 
 
+@pytest.mark.slow
 def test_an_older_run_stays_until_the_first_timestep(tmp_path, monkeypatch, port_of, capsys):
     path = tmp_path / "run"
     path.mkdir()

@@ -318,6 +318,7 @@ def test_what_was_not_used_when_a_connection_is_lost_is_forgotten(session):
     assert not records(session)["given"].any()
 
 
+@pytest.mark.slow
 def test_a_crashed_robot_of_a_lost_person_waits(session):
     place(session, *[placed([-0.8, 0.0], [-0.5, 0.0], violation=True)] * 4)
     with serving(session, timeout=2.0) as served:
@@ -527,6 +528,7 @@ def test_two_people_reset_one_robot_and_drive_another_to_its_goal(session, brows
     assert len(set(rows["robot"][given].tolist())) == 1
 
 
+@pytest.mark.slow
 def test_a_reload_keeps_the_seat_and_buttons_do_what_keys_do(session, browser):
     session.config = session.engine.config = session.config.replace(min_teleop_time=10_000)
     place(session, *[placed([-0.8, 0.0], [0.8, 0.0])] * 4)
@@ -556,6 +558,7 @@ def test_a_reload_keeps_the_seat_and_buttons_do_what_keys_do(session, browser):
     assert errors == []
 
 
+@pytest.mark.slow
 def test_a_token_opens_the_pages_of_a_browser(session, browser):
     errors: list[str] = []
     with serving(session, token=TOKEN) as served:

@@ -104,6 +104,7 @@ def test_there_are_pages():
     assert {"README.md", "docs/guide.md", "docs/custom.md"} <= set(PAGES)
 
 
+@pytest.mark.slow
 def test_examples_in_docstrings():
     names = [module.name for module in pkgutil.walk_packages(fleetjax.__path__, "fleetjax.")]
     results = [doctest.testmod(importlib.import_module(name)) for name in names if name != "fleetjax.__main__"]

@@ -35,7 +35,7 @@ def trained(name):
     return training, nets, (running_statistics.update(statistics, draws), policy, None)
 
 
-@pytest.mark.parametrize("name", ["humanoid", "anymal", "allegro_hand"])
+@pytest.mark.parametrize("name", ["humanoid", pytest.param("anymal", marks=pytest.mark.slow), "allegro_hand"])
 def test_weights_act_as_brax_does(name):
     """tanh of the mean, the clipped mean of robot and mirror image, or the clipped mean."""
     training, nets, params = trained(name)
@@ -96,6 +96,7 @@ def test_a_stage_sets_the_noise_and_nothing_else():
         jax.tree.map(np.testing.assert_array_equal, changed[module], policy["params"][module])
 
 
+@pytest.mark.slow
 def test_networks_see_the_view_and_a_stage_sets_the_tolerance():
     training = TRAININGS["allegro_hand"]
     easy = train_expert.Task(training, training.stages[0]._replace(options={"tolerance": 4.0}))

@@ -205,6 +205,7 @@ def test_inactive_robots_keep_their_state(name, backend):
     assert not np.any(np.all(after.qpos[active] == states.qpos[active], axis=1))
 
 
+@pytest.mark.slow
 @each_robot_and_backend
 def test_neighbours_do_not_matter(name, backend):
     states, controls = mixed(name)

@@ -151,7 +151,7 @@ def test_a_second_ctrl_c_stops_at_once_and_the_run_goes_on_from_an_older_checkpo
 
 
 @pytest.mark.usefixtures("compiled_both_ways")
-@pytest.mark.parametrize("every", [45, 119])
+@pytest.mark.parametrize("every", [45, pytest.param(119, marks=pytest.mark.slow)])
 def test_any_chunk_length_and_any_stop_give_the_same_bits(tmp_path, monkeypatch, whole, every):
     path = tmp_path / "stopped"
     with monkeypatch.context() as patch:
@@ -575,6 +575,7 @@ def test_a_kill_during_a_checkpoint_leaves_the_older_ones(stopped, whole, spawn,
     assert_same(stopped, whole)
 
 
+@pytest.mark.slow
 def test_a_full_disk_during_a_checkpoint_is_told_and_the_older_ones_stay(tmp_path, monkeypatch, whole, spawn):
     """Files may grow to a size that the logs need until t = 44, and that is too small for a checkpoint."""
     path, size = tmp_path / "stopped", (whole / "interventions.bin").stat().st_size * 44 // STEPS

@@ -91,7 +91,6 @@ CASES = {
     "benchmarks/physics.py": Case(
         ("humanoid --num-robots 4 --largest-mjx 0 --repeats 1",),
         (row("humanoid", "4", "raw rollout", r"[\d,]+", "1.00"), row("humanoid", "4", "native", r"[\d,]+", r"[\d.]+")),
-        quick=True,
     ),
     "benchmarks/scaling.py": Case(
         ("--environments navigation --num-robots 2 --num-seeds 1 --largest-navigation 10",),
@@ -123,7 +122,6 @@ CASES = {
         ),
         ("claims.md",),
         make_rows,
-        quick=True,
     ),
     "experiments/clone_error.py": Case(
         ("humanoid --demonstrations 256 --fresh 100 --gradient-steps 2",),

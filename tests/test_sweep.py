@@ -18,11 +18,11 @@ from commands import contents, refused
 from fleetjax import cli
 from fleetjax.io import crew, flags, folder, resumable, study, sweep
 
-STEPS = 3000
+STEPS = 2000
 TINY = [
     *("--num-robots", "2", "--num-humans", "2", "--num-steps", str(STEPS), "--hard-reset-time", "2"),
     *("--hidden-sizes", "8", "--ensemble-size", "2", "--batch-size", "8", "--critic-capacity", "300"),
-    *("--num-demonstrations", "20", "--pretraining-steps", "5", "--checkpoint-every", "200"),
+    *("--num-demonstrations", "20", "--pretraining-steps", "5", "--checkpoint-every", "100"),
 ]
 RESULTS = ("metrics.csv", "policy.msgpack")
 
@@ -376,7 +376,7 @@ def test_runs_of_one_program_compile_nothing_new(whole, compiled, tmp_path):
     compiled.clear()
     runs = planned("navigation", *RANDOM, "--random-threshold", "0.5,0.6", "--learning-rate", "1e-3,1e-4", output=tmp_path)
     for run in runs.values():
-        resumable.complete(run, checkpoint_every=200)
+        resumable.complete(run, checkpoint_every=100)
     assert compiled == []
     found = {name: results(run.folder) for name, run in runs.items()}
     assert found["navigation-random-random_threshold=0.5-learning_rate=0.001-seed0"] == whole[0]
@@ -414,7 +414,7 @@ def test_a_finished_sweep_starts_nothing_and_a_larger_one_only_what_is_new(copie
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        (("--num-steps", 300), "navigation-random-seed0: num_steps = 300, but the run has 3000 in "),
+        (("--num-steps", 300), f"navigation-random-seed0: num_steps = 300, but the run has {STEPS} in "),
         (("--random-threshold", 0.6), "navigation-random-seed0: random_threshold = 0.6, but the run has 0.5 in "),
         (("--log-interventions",), "navigation-random-seed0: log_interventions = True, but the run has False in "),
         (
@@ -464,17 +464,17 @@ def test_kills_of_workers_and_of_all_lose_nothing(tmp_path, spawn, whole):
     process = spawn(*command)
     with contextlib.ExitStack() as stack:
         stack.callback(process.kill)
-        wait_until(lambda: rows(the_run(output, 0)) > 500 and the_run(output, 1).exists(), process)
+        wait_until(lambda: rows(the_run(output, 0)) > 200 and the_run(output, 1).exists(), process)
         workers = children(process)
         assert {owner(the_run(output, 0)), owner(the_run(output, 1))} <= set(workers)
         process.kill()
         process.communicate()
         wait_for_end(workers)
-        assert 500 < rows(the_run(output, 0)) < STEPS
+        assert 200 < rows(the_run(output, 0)) < STEPS
 
         process = spawn(*command)
         stack.callback(process.kill)
-        wait_until(lambda: rows(the_run(output, 2)) > 500, process)
+        wait_until(lambda: rows(the_run(output, 2)) > 200, process)
         os.kill(owner(the_run(output, 2)), signal.SIGKILL)
         code, _, said = end(process)
     assert code == 1
@@ -497,7 +497,7 @@ def test_a_stopped_sweep_writes_checkpoints_and_resumes(tmp_path, spawn, whole, 
     process = spawn(*command)
     with contextlib.ExitStack() as stack:
         stack.callback(process.kill)
-        wait_until(lambda: rows(the_run(output, 0)) > 300, process)
+        wait_until(lambda: rows(the_run(output, 0)) > 200, process)
         workers = children(process)
         if number == signal.SIGINT:
             os.killpg(process.pid, number)  # as a terminal does
@@ -508,7 +508,7 @@ def test_a_stopped_sweep_writes_checkpoints_and_resumes(tmp_path, spawn, whole, 
     assert re.fullmatch("fleetjax: interrupted with [0-2] of 3 runs finished; repeat the command to resume", said[-1])
     wait_for_end(workers)
     assert together == 2 or not the_run(output, 1).exists()
-    assert 300 < rows(the_run(output, 0)) < STEPS
+    assert 200 < rows(the_run(output, 0)) < STEPS
     assert list(the_run(output, 0).glob("checkpoints/*/manifest.json"))
     code, _, said = end(spawn(*command))
     assert code == 0, said

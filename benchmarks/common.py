@@ -1,11 +1,9 @@
 """What the benchmarks share: a fleet that can be timed in stretches, and the machine's rate for a large matrix product."""
 
-import argparse
 import itertools
 import statistics
-import sys
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -15,9 +13,7 @@ import numpy as np
 from mujoco import rollout
 
 import fleetjax
-from fleetjax.config import FIELDS
 from fleetjax.envs import allegro_hand, anymal, humanoid
-from fleetjax.io import flags
 from fleetjax.physics.base import MODELS, PhysicsState
 from fleetjax.physics.native import num_threads
 
@@ -33,30 +29,6 @@ ROBOTS: dict[str, tuple[int, Callable[[jax.Array, mujoco.MjModel], jax.Array]]] 
 
 
 REGISTERED = [name for name in ROBOTS if name in fleetjax.list_envs()]
-
-
-def add_names(parser: argparse.ArgumentParser, dest: str, known: Collection[str]) -> None:
-    """Let a script be told names out of those that are known; without any it takes all."""
-
-    def check(name: str) -> str:  # in place of `choices`, which would be asked for the default as a whole
-        if name not in known:
-            raise argparse.ArgumentTypeError(f"{name!r} is none of {', '.join(known)}")
-        return name
-
-    parser.add_argument(
-        dest, nargs="*", type=check, default=list(known), help=f"out of {', '.join(known)}; all if none is given"
-    )
-
-
-def parse(parser: argparse.ArgumentParser) -> tuple[argparse.Namespace, dict[str, Any]]:
-    """Parse the command line; return the script's own arguments, and the fields of `Config` that follow `--`."""
-    words = sys.argv[1:]
-    cut = words.index("--") if "--" in words else len(words)
-    try:
-        found = vars(flags.parse(["run", *words[cut + 1 :]]))
-    except flags.Refusal as refusal:
-        parser.error(str(refusal))
-    return parser.parse_args(words[:cut]), {name: value for name, value in found.items() if name in FIELDS}
 
 
 def seconds(function: Callable[..., Any], *args: Any) -> tuple[float, Any]:

@@ -21,11 +21,9 @@ import numpy as np
 from common import (
     REGISTERED,
     RawRollout,
-    add_names,
     body_of,
     gradient_step_products,
     matrix_rate,
-    parse,
     product_timer,
     same_again,
     seconds,
@@ -34,6 +32,7 @@ from common import (
 )
 
 import fleetjax
+from fleetjax.io import scripts
 
 
 def measure(environment: str, parameters: dict[str, Any], *, num_steps: int, repeats: int) -> dict[str, str]:
@@ -84,10 +83,10 @@ def measure(environment: str, parameters: dict[str, Any], *, num_steps: int, rep
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add_names(parser, "environments", REGISTERED)
+    scripts.add_names(parser, "environments", REGISTERED)
     parser.add_argument("--steps", type=int, default=200, help="timesteps in a timed stretch")
     parser.add_argument("--repeats", type=int, default=7, help="timed stretches")
-    args, parameters = parse(parser)
+    args, parameters = scripts.parse(parser)
     print(table([measure(name, parameters, num_steps=args.steps, repeats=args.repeats) for name in args.environments]))
 
 

@@ -11,9 +11,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from common import REGISTERED, RawRollout, add_names, body_of, same_again, seconds, table
+from common import REGISTERED, RawRollout, body_of, same_again, seconds, table
 
 import fleetjax
+from fleetjax.io import scripts
 from fleetjax.physics.base import make_physics
 
 
@@ -64,7 +65,7 @@ def measure(environment: str, num_robots: int, *, backends: list[str], repeats: 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add_names(parser, "environments", REGISTERED)
+    scripts.add_names(parser, "environments", REGISTERED)
     parser.add_argument("--num-robots", type=int, nargs="+", default=[100, 1000])
     parser.add_argument("--largest-mjx", type=int, default=100, help="largest batch on mjx (more wants a GPU)")
     parser.add_argument("--repeats", type=int, default=5)

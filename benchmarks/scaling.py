@@ -10,9 +10,10 @@ import argparse
 from typing import Any, NamedTuple
 
 import jax
-from common import REGISTERED, add_names, median_seconds, quick_config, step_milliseconds, table
+from common import REGISTERED, median_seconds, quick_config, step_milliseconds, table
 
 import fleetjax
+from fleetjax.io import scripts
 
 
 class Sizes(NamedTuple):
@@ -99,7 +100,7 @@ def main() -> None:
     """Run the parts that are asked for."""
     parts = {"robots": robots, "humans": humans, "capacity": capacity, "seeds": seeds}
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add_names(parser, "parts", parts)
+    scripts.add_names(parser, "parts", parts)
     known = [*REGISTERED, "navigation"]
     parser.add_argument("--environments", nargs="+", choices=known, default=known, help="the first also stands for all")
     parser.add_argument("--num-robots", type=int, default=1000, help="N of the part `humans`")

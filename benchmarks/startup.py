@@ -12,7 +12,9 @@ import json
 import subprocess
 import sys
 
-from common import parse, table
+from common import table
+
+from fleetjax.io import scripts
 
 CHILD = """
 import time; begin = time.perf_counter()
@@ -42,7 +44,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--run-steps", type=int, default=300, help="timesteps to run before reading the peak memory")
     parser.add_argument("--environments", nargs="+", default=["navigation", "humanoid"])
-    args, parameters = parse(parser)
+    args, parameters = scripts.parse(parser)
     rows = []
     for environment in args.environments:
         command = [sys.executable, "-c", CHILD, environment, str(args.run_steps), json.dumps(parameters)]

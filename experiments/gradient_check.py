@@ -15,7 +15,6 @@ of `fleetjax run`.
 """
 
 import argparse
-import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -26,10 +25,9 @@ from matplotlib.figure import Figure
 
 import fleetjax
 from fleetjax import statistics
-from fleetjax.config import FIELDS as FIELDS_OF_A_RUN
 from fleetjax.config import Config, get_value
 from fleetjax.gradients import final_return
-from fleetjax.io import figure, files, flags, text
+from fleetjax.io import figure, files, scripts, text
 
 FIELDS = ("uncertainty_threshold", "risk_threshold", "violation_weight", "uncertainty_weight", "risk_weight")
 FLEET = {"num_robots": 20, "num_humans": 2, "num_steps": 300, "initial_period": 0, "critic_capacity": 10_000}
@@ -162,21 +160,15 @@ def draw(curves: dict[str, Iterable[tuple[float, float]]]) -> Figure:
 def main() -> None:
     """Run the checks, print their tables, and draw the figure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("checks", nargs="*", metavar="CHECK", help=f"out of {', '.join(CHECKS)} [default: all]")
+    scripts.add_names(parser, "checks", CHECKS)
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--num-samples", type=int, default=128, help="runs of each seed for the smoothed gradient")
     parser.add_argument("--fresh", type=int, default=20, help="fresh seeds on which steps are judged")
     parser.add_argument("--lengths", type=int, nargs="+", default=LENGTHS, help="timesteps")
     parser.add_argument("--output", type=Path, help="figure")
-    words = sys.argv[1:]
-    cut = words.index("--") if "--" in words else len(words)
-    args = parser.parse_args(words[:cut])
-    for name in args.checks:
-        if name not in CHECKS:
-            parser.error(f"{name}: choose out of {', '.join(CHECKS)}")
-    given = {name: value for name, value in vars(flags.parse(["run", *words[cut + 1 :]])).items() if name in FIELDS_OF_A_RUN}
+    args, given = scripts.parse(parser)
     config = fleetjax.make_config("navigation", "weighted", **FLEET | given)
-    keys, wanted, curves = jax.random.split(jax.random.key(0), args.seeds), args.checks or CHECKS, {}
+    keys, wanted, curves = jax.random.split(jax.random.key(0), args.seeds), args.checks, {}
     reference = np.zeros(len(FIELDS))
 
     def show(title: str, table: Table) -> None:

@@ -17,7 +17,7 @@ from pathlib import Path
 import jax
 
 from fleetjax import compare, evaluate, plot
-from fleetjax.io import comparing, figure, files, folder, rows, sweep
+from fleetjax.io import comparing, figure, files, folder, rows, scripts, sweep
 from fleetjax.io.outcomes import Outcome, group
 from fleetjax.io.sources import collect
 from fleetjax.io.study import Study, make_study, plan
@@ -119,7 +119,7 @@ class Part:
 def main() -> None:
     """Run the parts that are asked for, then show what they gave."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", metavar="PART", help=f"one or more of {', '.join(PARTS)} [default: all]")
+    scripts.add_names(parser, "parts", PARTS)
     parser.add_argument("--studies", type=Path, default=HERE / "studies", help="folder of the parts' files")
     parser.add_argument("--seeds", type=int, help="number of seeds, instead of the file's")
     parser.add_argument("--workers", type=int, help="processes [default: one for each core]")
@@ -127,11 +127,8 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=HERE / "results", help="folder for rows, tables and figures")
     parser.add_argument("--rows-only", action="store_true", help="no runs; only tables and figures")
     args = parser.parse_args()
-    for name in args.parts:
-        if name not in PARTS:
-            parser.error(f"{name}: choose out of {', '.join(PARTS)}")
     args.results.mkdir(parents=True, exist_ok=True)
-    for part in [Part(name, args) for name in args.parts or PARTS]:
+    for part in [Part(name, args) for name in args.parts]:
         if not args.rows_only:
             part.evaluate(Part(TRAINED, args)) if part.name == "policies" else part.run()
         part.show()

@@ -11,17 +11,17 @@ QUICK_FLAGS = "--xla_cpu_use_fusion_emitters=false"
 
 # Files that take longest. They begin first, so that the workers end at about the same time.
 LONGEST = (
-    "sweep",
-    "scripts",
-    "physics",
-    "learning",
     "resume",
-    "console",
-    "fuzz",
-    "containment",
-    "console_web",
-    "whole_loop",
     "faults",
+    "conformity",
+    "gradients",
+    "fuzz",
+    "console_web",
+    "oracle",
+    "expert",
+    "physics",
+    "containment",
+    "console",
 )
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in what a shell runs in the background; tests interrupt runs

@@ -13,6 +13,8 @@ import fleetjax
 from fleetjax.envs import begin
 from fleetjax.learning import imitation
 
+pytestmark = pytest.mark.slow
+
 NUM_CHOICES = 4
 
 

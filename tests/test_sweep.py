@@ -353,6 +353,7 @@ def swept(tmp_path_factory, spawn):
     return output, command, out, said
 
 
+@pytest.mark.slow
 def test_a_sweep_gives_the_folders_that_plain_runs_give(swept, whole, capsys):
     output, _, out, said = swept
     names = [f"navigation-{algorithm}-seed{seed}" for algorithm in ("random", "expert") for seed in (0, 1)]
@@ -411,6 +412,7 @@ def test_a_finished_sweep_starts_nothing_and_a_larger_one_only_what_is_new(copie
     assert {name for name in before if after[name] != before[name]} == {"sweep.json"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [

@@ -1,0 +1,121 @@
+"""Which part of C.U.R. matters, and by how much: derivatives by the weights of its parts, and runs without a part.
+
+    python experiments/which_part.py [ENV ...] [--seeds 3] [--removals 10] [--num-samples 32] [-- PARAMETERS]
+
+The parts are violations, uncertainty and risk. The rule is `weighted`, with all weights 1 and without an initial period.
+
+For each of --seeds there is the smoothed derivative of the return on human effort by the logarithm of each weight
+(`fleetjax.sensitivity`). For each of --removals there is a whole run, and one without each part, trained anew. PARAMETERS are
+those of `fleetjax run`.
+
+Rows go to `experiments/results/which_part.csv` (--rows) as they come. Repeat the command to resume.
+"""
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import numpy as np
+import pandas as pd
+
+import fleetjax
+from fleetjax import statistics
+from fleetjax.config import Config, get_value
+from fleetjax.gradients import final_return
+from fleetjax.io import files, scripts, text
+
+PARTS = {"violation_weight": "violation", "uncertainty_weight": "uncertainty", "risk_weight": "risk"}
+STEPS = {"navigation": 500, "humanoid": 1000}
+WIDTH = 0.5  # of the noise, in units of a weight: a tenth would hardly change who is helped
+DERIVATIVE, WHOLE, REMOVED = "derivative", "whole", "removed"  # kinds of rows
+COLUMNS = ("environment", "timesteps", "kind", "part", "seed", "value", "error")
+
+Row = tuple[str, int, str, str, int, float, float]
+
+
+def derivatives(config: Config, seed: int, num_samples: int) -> Iterator[tuple[str, float, float]]:
+    """Yield each part, the derivative of the return by the logarithm of its weight, and its standard error for this seed."""
+    key = jax.random.key(seed)
+    found = jax.jit(
+        lambda config: fleetjax.sensitivity(
+            config, key, list(PARTS), num_samples=num_samples, width={name: WIDTH * get_value(config, name) for name in PARTS}
+        )
+    )(config)
+    for name, part in PARTS.items():
+        weight = float(get_value(config, name))
+        yield part, float(found.gradient[name]) * weight, float(found.standard_error[name]) * weight
+
+
+@jax.jit
+def returned(config: Config, key: jax.Array) -> jax.Array:
+    """Return f32[], the return on human effort at the end of a run."""
+    return final_return(fleetjax.run(config, key).metrics, config)
+
+
+def missing_rows(config: Config, stored: pd.DataFrame, args: argparse.Namespace) -> Iterator[list[Row]]:
+    """Yield the rows that are not stored yet, of one seed and kind after the other."""
+
+    def is_stored(kind: str, seed: int) -> bool:
+        place = (stored["environment"] == config.environment) & (stored["timesteps"] == config.num_steps)
+        return bool(np.any(place & (stored["kind"] == kind) & (stored["seed"] == seed)))
+
+    def row(kind: str, part: str, seed: int, value: float, error: float = float("nan")) -> Row:
+        return config.environment, config.num_steps, kind, part, seed, value, error
+
+    for seed in range(args.removals):
+        if not is_stored(REMOVED, seed):
+            key = jax.random.key(seed)
+            removed = {part: config.replace(**{name: 0.0}) for name, part in PARTS.items()}
+            whole = row(WHOLE, "", seed, float(returned(config, key)))
+            yield [whole, *(row(REMOVED, part, seed, float(returned(other, key))) for part, other in removed.items())]
+    for seed in range(args.seeds):
+        if not is_stored(DERIVATIVE, seed):
+            yield [row(DERIVATIVE, part, seed, *found) for part, *found in derivatives(config, seed, args.num_samples)]
+
+
+def show(rows: pd.DataFrame) -> str:
+    """Return a table of derivatives, and of what removal changes, with 95 % intervals over seeds or ranges of few."""
+
+    def interval(values: np.ndarray) -> str:
+        low, high = statistics.mean_bounds(values)
+        return f"{values.mean():.3f} ({low:.3f} to {high:.3f})"
+
+    table: list[tuple[str, ...]] = [
+        ("environment", "part", "derivative by log weight", "change without the part", "return with all parts")
+    ]
+    for place, found in rows.groupby("environment", sort=False):
+        kind, own = found["kind"].to_numpy(), found["part"].to_numpy()
+        values = found["value"].to_numpy(dtype=float)
+        whole = values[kind == WHOLE]
+        for part in PARTS.values():
+            slopes, without = (values[(kind == which) & (own == part)] for which in (DERIVATIVE, REMOVED))
+            shown = [interval(values) if len(values) else "-" for values in (slopes, without - whole, whole)]
+            table.append((str(place), part, *shown))
+    return text.markdown_table(table)
+
+
+def main() -> None:
+    """Compute the rows that are missing, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    scripts.add_names(parser, "environments", STEPS)
+    parser.add_argument("--seeds", type=int, default=3, help="number of seeds for derivatives")
+    parser.add_argument("--removals", type=int, default=10, help="number of seeds for runs with and without each part")
+    parser.add_argument("--num-samples", type=int, default=32, help="shifted runs for each derivative")
+    parser.add_argument("--rows", type=Path, default=Path(__file__).parent / "results" / "which_part.csv", metavar="FILE.csv")
+    args, given = scripts.parse(parser)
+    stored = pd.read_csv(args.rows) if args.rows.exists() else pd.DataFrame(columns=COLUMNS)
+    for name in args.environments:
+        wanted = {"num_steps": STEPS[name], "initial_period": 0, **dict.fromkeys(PARTS, 1.0)}
+        config = fleetjax.make_config(name, "weighted", **wanted | given)
+        for rows in missing_rows(config, stored, args):
+            found = pd.DataFrame(rows, columns=COLUMNS)
+            stored = pd.concat([stored, found], ignore_index=True) if len(stored) else found
+            files.write(args.rows, stored.to_csv(index=False, float_format="%.6g").encode())
+            print(f"{name}: {rows[0][2]}, seed {rows[0][4]}", flush=True)
+    if len(stored):
+        print(show(stored))
+
+
+if __name__ == "__main__":
+    main()

@@ -13,6 +13,7 @@ Rows go to `experiments/results/which_part.csv` (--rows) as they come. Repeat th
 
 import argparse
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -34,17 +35,15 @@ COLUMNS = ("environment", "timesteps", "kind", "part", "seed", "value", "error")
 Row = tuple[str, int, str, str, int, float, float]
 
 
-def derivatives(config: Config, seed: int, num_samples: int) -> Iterator[tuple[str, float, float]]:
-    """Yield each part, the derivative of the return by the logarithm of its weight, and its standard error for this seed."""
-    key = jax.random.key(seed)
-    found = jax.jit(
-        lambda config: fleetjax.sensitivity(
-            config, key, list(PARTS), num_samples=num_samples, width={name: WIDTH * get_value(config, name) for name in PARTS}
-        )
-    )(config)
-    for name, part in PARTS.items():
-        weight = float(get_value(config, name))
-        yield part, float(found.gradient[name]) * weight, float(found.standard_error[name]) * weight
+@partial(jax.jit, static_argnames="num_samples")
+def derivatives(config: Config, key: jax.Array, num_samples: int) -> dict[str, tuple[jax.Array, jax.Array]]:
+    """Return for each part f32[] the derivative of the return by the logarithm of its weight, and f32[] its error."""
+    weights = {name: get_value(config, name) for name in PARTS}
+    width = {name: WIDTH * weight for name, weight in weights.items()}
+    found = fleetjax.sensitivity(config, key, list(PARTS), num_samples=num_samples, width=width)
+    return {
+        part: (found.gradient[name] * weights[name], found.standard_error[name] * weights[name]) for name, part in PARTS.items()
+    }
 
 
 @jax.jit
@@ -71,7 +70,8 @@ def missing_rows(config: Config, stored: pd.DataFrame, args: argparse.Namespace)
             yield [whole, *(row(REMOVED, part, seed, float(returned(other, key))) for part, other in removed.items())]
     for seed in range(args.seeds):
         if not is_stored(DERIVATIVE, seed):
-            yield [row(DERIVATIVE, part, seed, *found) for part, *found in derivatives(config, seed, args.num_samples)]
+            found = derivatives(config, jax.random.key(seed), args.num_samples)
+            yield [row(DERIVATIVE, part, seed, float(slope), float(error)) for part, (slope, error) in found.items()]
 
 
 def show(rows: pd.DataFrame) -> str:
@@ -112,7 +112,7 @@ def main() -> None:
             found = pd.DataFrame(rows, columns=COLUMNS)
             stored = pd.concat([stored, found], ignore_index=True) if len(stored) else found
             files.write(args.rows, stored.to_csv(index=False, float_format="%.6g").encode())
-            print(f"{name}: {rows[0][2]}, seed {rows[0][4]}", flush=True)
+            print(f"{name}: {rows[-1][2]}, seed {rows[-1][4]}", flush=True)
     if len(stored):
         print(show(stored))
 

@@ -250,7 +250,7 @@ def _widths(config: Config, names: Sequence[str], width: float | Mapping[str, fl
     share = WIDTH if width is None or isinstance(width, Mapping) else width
     widths = {name: given[name] if name in given else share * abs(_concrete(config, name)) for name in names}
     for name, found in widths.items():
-        if not found > 0:
+        if not isinstance(found, Tracer) and not found > 0:
             raise ValueError(f"width of {name} = {found} must be positive; pass width={{{name!r}: ...}}")
     return {name: jnp.float32(found) for name, found in widths.items()}
 

@@ -239,6 +239,14 @@ def test_smoothed_gradients_are_those_of_the_mean(config):
         assert 0.5 < found.standard_error[name] / (deviation / 200**0.5) < 2.5
 
 
+def test_a_width_may_be_traced(config):
+    def found(config):
+        width = {"risk_weight": 0.5 * config.parameters["risk_weight"]}
+        return fleetjax.sensitivity(config, KEYS[0], "risk_weight", width=width, num_samples=2)
+
+    assert jax.eval_shape(found, config).gradient["risk_weight"].shape == ()
+
+
 @pytest.mark.slow
 def test_whole_numbers_can_be_smoothed(config):
     worth = lambda metrics, config: config.min_teleop_time.astype(jnp.float32) ** 2  # noqa: E731

@@ -88,6 +88,14 @@ CASES = {
     "benchmarks/fleet_step.py": Case(
         (f"humanoid --steps 2 --repeats 1 -- {FLEET}",), (row("humanoid", r"\d+ %", r"[\d.]+", r"[\d.]+"),)
     ),
+    "benchmarks/gradients.py": Case(
+        (f"--lengths 4 9 --num-samples 2 --repeats 1 -- {FLEET} --algorithm weighted",),
+        (
+            row("4", r"[\d.]+", r"[\d.]+", r"[\d.]+", r"\d+", r"\d+"),
+            row("9", r"[\d.]+", r"[\d.]+", r"[\d.]+", r"\d+", r"\d+"),
+            row("4", r"[\d,.]+", r"[\d,.]+", r"[\d.]+"),
+        ),
+    ),
     "benchmarks/physics.py": Case(
         ("humanoid --num-robots 4 --largest-mjx 0 --repeats 1",),
         (row("humanoid", "4", "raw rollout", r"[\d,]+", "1.00"), row("humanoid", "4", "native", r"[\d,]+", r"[\d.]+")),
@@ -178,6 +186,18 @@ CASES = {
         ),
         (r"^\{'steps': 64, ", r"^shipped \{'environment': 'humanoid', 'steps': 64, 'num_episodes': 2"),
         ("expert/curve.csv", "expert/checkpoint_0000000064.msgpack", *(f"weights/humanoid{x}" for x in (".npz", "_curve.csv"))),
+    ),
+    "experiments/which_part.py": Case(
+        (
+            f"navigation --seeds 2 --removals 1 --num-samples 2 --rows rows.csv -- {FLEET}",
+            f"navigation --rows rows.csv --seeds 2 --removals 2 -- {FLEET}",
+        ),
+        (
+            r"^navigation: removed, seed 0\nnavigation: derivative, seed 0\nnavigation: derivative, seed 1\n\| environment",
+            r"^navigation: removed, seed 1\n\| environment",
+            row("navigation", "uncertainty", *[r"[-\d.]+ \([-\d.]+ to [-\d.]+\)"] * 3),
+        ),
+        ("rows.csv",),
     ),
 }
 

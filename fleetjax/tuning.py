@@ -71,12 +71,13 @@ def tune(
     request, hard = check_request(config, keys, fields, method, width, num_samples, env), config
     config, env, names = request.config, request.env, request.names
     known = all_fields(config.algorithm)
-    start = {name: jnp.float32(get_value(config, name)) for name in names}
-    for name, value in start.items():
+    for name in names:
+        value = get_value(config, name)
         if known[name].kind is not float:
             raise ValueError(f"{name} is a whole number and cannot be tuned; omit it")
-        if not isinstance(value, Tracer) and value == 0:
+        if not isinstance(value, Tracer) and float(value) == 0:
             raise ValueError(f"{name} = 0 cannot be tuned: steps are in units of the first value; start from another one")
+    start = {name: jnp.float32(get_value(config, name)) for name in names}
     derive = make_gradient(config, env, objective or final_return, names, method, request.widths, num_samples)
     states = jax.lax.map(lambda key: prepare(config, key, env), request.keys)
 

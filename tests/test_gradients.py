@@ -239,6 +239,11 @@ def test_smoothed_gradients_are_those_of_the_mean(config):
         assert 0.5 < found.standard_error[name] / (deviation / 200**0.5) < 2.5
 
 
+def test_tuning_can_be_compiled(config):
+    found = jax.eval_shape(lambda keys: fleetjax.tune(config, keys, "risk_weight", steps=2, num_samples=2), KEYS)
+    assert found.values["risk_weight"].shape == (3,)
+
+
 def test_a_width_may_be_traced(config):
     def found(config):
         width = {"risk_weight": 0.5 * config.parameters["risk_weight"]}

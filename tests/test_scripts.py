@@ -187,6 +187,14 @@ CASES = {
         (r"^\{'steps': 64, ", r"^shipped \{'environment': 'humanoid', 'steps': 64, 'num_episodes': 2"),
         ("expert/curve.csv", "expert/checkpoint_0000000064.msgpack", *(f"weights/humanoid{x}" for x in (".npz", "_curve.csv"))),
     ),
+    "experiments/tuning_check.py": Case(
+        (f"--steps 1 --seeds 2 --num-samples 2 --fresh 2 -- {FLEET}",),
+        (
+            r"^objective before each step: [\d.]+$",
+            r"^grid: 3 points, the best with a mean of [\d.]+$",
+            row("best of the grid", *[r"[\d.]+"] * 6, r"-?[\d.]+", r"-?[\d.]+ to -?[\d.]+"),
+        ),
+    ),
     "experiments/which_part.py": Case(
         (
             f"navigation --seeds 2 --removals 1 --num-samples 2 --rows rows.csv -- {FLEET}",

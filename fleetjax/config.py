@@ -56,7 +56,7 @@ class Config(Fields):
 ALLOCATIONS = ("hard", "soft")
 _LARGEST = 2**31 - 1
 _LARGEST_EXACT = 2**24  # beyond it f32 skips whole numbers
-_OFFLINE = ("num_demonstrations", "extra_demonstrations")
+_DEMONSTRATIONS = ("num_demonstrations", "extra_demonstrations")
 _TRACED = [name for name, field in FIELDS.items() if field.traced]
 _STATIC = [name for name, field in FIELDS.items() if not field.traced]
 jax.tree_util.register_dataclass(Config, data_fields=[*_TRACED, "parameters"], meta_fields=[*_STATIC, "capacity_given"])
@@ -181,7 +181,7 @@ def needed_human_capacity(config: Config) -> int:
 
 
 def _has_concrete_offline(config: Config) -> bool:
-    return all(_is_concrete(getattr(config, name)) for name in _OFFLINE)
+    return all(_is_concrete(getattr(config, name)) for name in _DEMONSTRATIONS)
 
 
 def _with_capacity(before: Config, after: Config, changes: Mapping[str, Any]) -> Config:
@@ -197,7 +197,7 @@ def _with_capacity(before: Config, after: Config, changes: Mapping[str, Any]) ->
         return dataclasses.replace(after, human_capacity=max(after.human_capacity, needed))
     if _has_concrete_offline(after) or not priority.get_algorithm(after.algorithm).pretrains:
         return dataclasses.replace(after, human_capacity=needed, capacity_given=False)
-    for name in _OFFLINE:
+    for name in _DEMONSTRATIONS:
         if name in changes and not _is_concrete(getattr(after, name)):
             raise ValueError(
                 f"{name} is traced. Also pass human_capacity: the largest number of demonstrations times "

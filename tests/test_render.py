@@ -168,3 +168,7 @@ def test_a_notebook_shows_the_robots_of_a_run(tmp_path):
     assert shown._repr_html_().startswith('<img alt="animated robots" src="data:image/gif;base64,R0lGOD')
     with pytest.raises(ValueError, match="every = 0"):
         fleetjax.animate(config, jax.random.key(0), every=0)
+    result = jax.jit(fleetjax.run)(config, jax.random.key(0))
+    assert fleetjax.animate(config, jax.random.key(1), result.state, num_shown=1, width=20).gif
+    with pytest.raises(ValueError, match="num_robots = 4, but the state was prepared for 3"):
+        fleetjax.animate(config.replace(num_robots=4, num_humans=4), jax.random.key(1), result.state)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import jax
 
-from fleetjax import envs
+from fleetjax import checks
 from fleetjax.config import Config, taught_pairs
 from fleetjax.experiment import extend, prepare
 from fleetjax.fleet import FleetState
@@ -45,14 +45,15 @@ def animate(
         width: of each robot's picture (pixels).
 
     Raises:
-        ValueError: if a number is below 1, the environment has nothing to draw, or no OpenGL library is found.
+        ValueError: if a number is below 1, the environment has nothing to draw, no OpenGL library is found, or the state does
+            not fit the configuration.
     """
     for name, value in {"num_shown": num_shown, "every": every, "width": width}.items():
         if value < 1:
             raise ValueError(f"{name} = {value} must be at least 1")
     render.check(config)
     start = jax.jit(prepare)(config, key) if state is None else extend(state, taught_pairs(config))
+    env = checks.check_run(config, state=start)
     film = render.shoot(config, key, start, num_shown=num_shown)
-    env = envs.make(config.environment, config.backend)
     pictures = render.draw(film, env.scene, width=width, every=every)
     return Animation(render.encode(pictures, Path("film.gif"), rate=1 / (env.spec.control_step * every)))

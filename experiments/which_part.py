@@ -5,10 +5,11 @@
 The parts are violations, uncertainty and risk. The rule is `weighted`, with all weights 1 and without an initial period.
 
 For each of --seeds there is the smoothed derivative of the return on human effort by the logarithm of each weight
-(`fleetjax.sensitivity`). For each of --removals there is a whole run, and one without each part, trained anew. PARAMETERS are
-those of `fleetjax run`.
+(`fleetjax.sensitivity`). For each of --removals there is a whole run, and one without each part, trained anew. On Humanoid no
+episode ends within 1,000 timesteps, so rewards stand for successes there, in units of the return that a success takes.
+PARAMETERS are those of `fleetjax run`.
 
-Rows go to `experiments/results/which_part.csv` (--rows) as they come. Repeat the command to resume.
+Rows go to `experiments/notebooks/which_part.csv` (--rows) as they come. Repeat the command to resume.
 """
 
 import argparse
@@ -35,12 +36,19 @@ COLUMNS = ("environment", "timesteps", "kind", "part", "seed", "value", "error")
 Row = tuple[str, int, str, str, int, float, float]
 
 
+def worth(metrics: fleetjax.Metrics, config: Config) -> jax.Array:
+    """Return f32[], the return on human effort at the end of a run; see above for Humanoid."""
+    if config.environment == "humanoid":
+        metrics = metrics._replace(successes=metrics.reward / config.success_return)
+    return final_return(metrics, config)
+
+
 @partial(jax.jit, static_argnames="num_samples")
 def derivatives(config: Config, key: jax.Array, num_samples: int) -> dict[str, tuple[jax.Array, jax.Array]]:
     """Return for each part f32[] the derivative of the return by the logarithm of its weight, and f32[] its error."""
     weights = {name: get_value(config, name) for name in PARTS}
     width = {name: WIDTH * weight for name, weight in weights.items()}
-    found = fleetjax.sensitivity(config, key, list(PARTS), num_samples=num_samples, width=width)
+    found = fleetjax.sensitivity(config, key, list(PARTS), objective=worth, num_samples=num_samples, width=width)
     return {
         part: (found.gradient[name] * weights[name], found.standard_error[name] * weights[name]) for name, part in PARTS.items()
     }
@@ -48,8 +56,8 @@ def derivatives(config: Config, key: jax.Array, num_samples: int) -> dict[str, t
 
 @jax.jit
 def returned(config: Config, key: jax.Array) -> jax.Array:
-    """Return f32[], the return on human effort at the end of a run."""
-    return final_return(fleetjax.run(config, key).metrics, config)
+    """Return f32[], what a run is worth."""
+    return worth(fleetjax.run(config, key).metrics, config)
 
 
 def missing_rows(config: Config, stored: pd.DataFrame, args: argparse.Namespace) -> Iterator[list[Row]]:
@@ -102,7 +110,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3, help="number of seeds for derivatives")
     parser.add_argument("--removals", type=int, default=10, help="number of seeds for runs with and without each part")
     parser.add_argument("--num-samples", type=int, default=32, help="shifted runs for each derivative")
-    parser.add_argument("--rows", type=Path, default=Path(__file__).parent / "results" / "which_part.csv", metavar="FILE.csv")
+    parser.add_argument("--rows", type=Path, default=Path(__file__).parent / "notebooks" / "which_part.csv", metavar="FILE.csv")
     args, given = scripts.parse(parser)
     stored = pd.read_csv(args.rows) if args.rows.exists() else pd.DataFrame(columns=COLUMNS)
     for name in args.environments:

@@ -33,8 +33,9 @@ FIELDS = ("uncertainty_threshold", "risk_threshold", "violation_weight", "uncert
 FLEET = {"num_robots": 20, "num_humans": 2, "num_steps": 300, "initial_period": 0, "critic_capacity": 10_000}
 TEMPERATURES = (1.0, 0.3, 0.1, 0.03, 0.01)
 LENGTHS = (30, 100, 300, 1000)
+SHORT = (3, 10, 30, 100)  # of finite differences
 STEP = 0.3  # by which a step changes the logarithms of all fields, as a vector
-DIFFERENCE = 1e-2  # half the relative distance of the two runs of a finite difference
+DIFFERENCE = 2e-3  # half the relative distance of the two runs of a finite difference
 EVENTS = ("violations", "hard_resets", "idle", "switches", "choices")  # counts that differ if a hard event does
 CHECKS = ("differences", "temperature", "steps", "length")
 
@@ -63,8 +64,8 @@ def final_returns(config: Config, keys: jax.Array) -> jax.Array:
     return jax.lax.map(lambda key: final_return(fleetjax.run(config, key).metrics, config), keys)
 
 
-def check_differences(config: Config, keys: jax.Array) -> Table:
-    """Compare relaxed gradients with finite differences."""
+def check_differences(config: Config, keys: jax.Array, lengths: Sequence[int]) -> Table:
+    """Compare relaxed gradients with finite differences, by the length of the run."""
     soft = config.replace(allocation="soft", temperature=TEMPERATURES[1])
     prepare = jax.jit(fleetjax.prepare)
 
@@ -74,21 +75,26 @@ def check_differences(config: Config, keys: jax.Array) -> Table:
         counts = [getattr(metrics, name) for name in EVENTS]
         return final_return(metrics, config), [*counts, last.env.episode_step, last.humans.robot]
 
-    errors: dict[bool, list[float]] = {False: [], True: []}
-    for key in keys:
-        state, slopes = prepare(soft, key), relaxed(soft, key[None]).gradient
-        for name in FIELDS:
-            value = get_value(soft, name)
-            (high, above), (low, below) = (
-                run(soft.replace(**{name: value * (1 + sign * DIFFERENCE)}), key, state) for sign in (1, -1)
-            )
-            switched = any(np.any(x != y) for x, y in zip(above, below, strict=True))
-            slope, difference = float(slopes[name]), float((high - low) / (2 * DIFFERENCE * value))
-            errors[switched].append(abs(slope - difference) / max(abs(slope), abs(difference), 1e-12))
-    rows: Table = [("hard events between the runs", "pairs", "median error", "90th percentile")]
-    for switched, found in errors.items():
-        shown = [f"{100 * np.quantile(found, q):.2g} %" for q in (0.5, 0.9)] if found else ["-", "-"]
-        rows.append(("some" if switched else "none", str(len(found)), *shown))
+    def compare(config: Config, name: str, slope: float, key: jax.Array, state: fleetjax.FleetState) -> tuple[bool, float]:
+        """Return whether a hard event lies between the two runs of a difference, and how far it is from the slope."""
+        value = get_value(config, name)
+        ends = [run(config.replace(**{name: value * (1 + sign * DIFFERENCE)}), key, state) for sign in (1, -1)]
+        (high, above), (low, below) = ends
+        difference = float((high - low) / (2 * DIFFERENCE * value))
+        switched = any(np.any(x != y) for x, y in zip(above, below, strict=True))
+        return switched, abs(slope - difference) / max(abs(slope), abs(difference), 1e-12)
+
+    rows: Table = [("timesteps", "hard events between the runs", "pairs", "median error", "90th percentile")]
+    for length in lengths:
+        shorter, errors = soft.replace(num_steps=length), {False: [], True: []}
+        for key in keys:
+            state, slopes = prepare(shorter, key), relaxed(shorter, key[None]).gradient
+            for name in FIELDS:
+                switched, error = compare(shorter, name, float(slopes[name]), key, state)
+                errors[switched].append(error)
+        for switched, found in errors.items():
+            shown = [f"{100 * np.quantile(found, q):.2g} %" for q in (0.5, 0.9)] if found else ["-", "-"]
+            rows.append((str(length), "some" if switched else "none", str(len(found)), *shown))
     return rows
 
 
@@ -164,7 +170,8 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--num-samples", type=int, default=128, help="runs of each seed for the smoothed gradient")
     parser.add_argument("--fresh", type=int, default=20, help="fresh seeds on which steps are judged")
-    parser.add_argument("--lengths", type=int, nargs="+", default=LENGTHS, help="timesteps")
+    parser.add_argument("--lengths", type=int, nargs="+", default=LENGTHS, help="timesteps for `length`")
+    parser.add_argument("--differences", type=int, nargs="+", default=SHORT, help="timesteps for `differences`")
     parser.add_argument("--output", type=Path, help="figure")
     args, given = scripts.parse(parser)
     config = fleetjax.make_config("navigation", "weighted", **FLEET | given)
@@ -175,7 +182,7 @@ def main() -> None:
         print(f"{title}\n\n{text.markdown_table(table)}\n", flush=True)
 
     if "differences" in wanted:
-        show("Relaxed gradients and finite differences", check_differences(config, keys))
+        show("Relaxed gradients and finite differences", check_differences(config, keys, args.differences))
     if {"temperature", "steps"} & set(wanted):
         found = jax.jit(lambda keys: fleetjax.sensitivity(config, keys, FIELDS, num_samples=args.num_samples))(keys)
         reference = relative(config, found)

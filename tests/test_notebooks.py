@@ -23,7 +23,7 @@ def parameters(notebook):
 
 
 def test_there_are_notebooks():
-    assert {"first_fleet.ipynb", "your_own_rule.ipynb"} <= set(NAMES)
+    assert {"first_fleet.ipynb", "which_part_matters.ipynb", "your_own_rule.ipynb"} <= set(NAMES)
 
 
 def test_a_notebook_says_first_what_one_will_learn(notebook):

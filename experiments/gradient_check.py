@@ -34,6 +34,7 @@ FLEET = {"num_robots": 20, "num_humans": 2, "num_steps": 300, "initial_period": 
 TEMPERATURES = (1.0, 0.3, 0.1, 0.03, 0.01)
 LENGTHS = (30, 100, 300, 1000)
 SHORT = (3, 10, 30, 100)  # of finite differences
+WIDTH = 0.5  # of the noise in smoothed gradients, in units of each field; less leaves more noise than slope
 STEP = 0.3  # by which a step changes the logarithms of all fields, as a vector
 DIFFERENCE = 2e-3  # half the relative distance of the two runs of a finite difference
 EVENTS = ("violations", "hard_resets", "idle", "switches", "choices")  # counts that differ if a hard event does
@@ -184,7 +185,8 @@ def main() -> None:
     if "differences" in wanted:
         show("Relaxed gradients and finite differences", check_differences(config, keys, args.differences))
     if {"temperature", "steps"} & set(wanted):
-        found = jax.jit(lambda keys: fleetjax.sensitivity(config, keys, FIELDS, num_samples=args.num_samples))(keys)
+        smoothed = jax.jit(lambda keys: fleetjax.sensitivity(config, keys, FIELDS, num_samples=args.num_samples, width=WIDTH))
+        found = smoothed(keys)
         reference = relative(config, found)
         errors = [float(found.standard_error[name] * get_value(config, name)) for name in FIELDS]
         table = [(f, f"{x:.3f}", f"{e:.3f}") for f, x, e in zip(FIELDS, reference, errors, strict=True)]

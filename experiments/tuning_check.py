@@ -2,8 +2,9 @@
 
     python experiments/tuning_check.py [--steps 8] [--seeds 3] [--num-samples 6] [--fresh 20] [-- PARAMETERS]
 
-Tuned are the thresholds of uncertainty and risk, and the weights of violation, uncertainty and risk. The grid spans both
-thresholds and the weight of risk; its best point is that with the highest mean return over the seeds that tuning has, too.
+`tune` changes five parameters: the thresholds of uncertainty and risk, and the weights of violation, uncertainty and risk. The
+grid varies both thresholds and the weight of risk. As many of its points as tuning takes runs for each seed are tried, the
+nearest to the start first, and the best is picked on the seeds of tuning.
 PARAMETERS are those of `fleetjax run`.
 """
 

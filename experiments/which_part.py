@@ -2,14 +2,16 @@
 
     python experiments/which_part.py [ENV ...] [--seeds 3] [--removals 10] [--num-samples 32] [-- PARAMETERS]
 
-The parts are violations, uncertainty and risk. The rule is `weighted`, with all weights 1 and without an initial period.
+The parts are violations, uncertainty and risk. The rule is not C.U.R. itself, which is an order, but
+`weighted`, with all weights 1 and without an initial period.
 
 For each of --seeds there is the smoothed derivative of the return on human effort by the logarithm of each weight
-(`fleetjax.sensitivity`). For each of --removals there is a whole run, and one without each part, trained anew. On Humanoid no
-episode ends within 1,000 timesteps, so rewards stand for successes there, in units of the return that a success takes.
-PARAMETERS are those of `fleetjax run`.
+(`fleetjax.sensitivity`). For each of --removals there is a whole run, and one without each part, trained anew. An episode
+on Humanoid takes 999 timesteps, so a run of 1,000 has almost no successes: there rewards stand for them, in units of the return
+that a success needs. PARAMETERS are those of `fleetjax run`.
 
-Rows go to `experiments/notebooks/which_part.csv` (--rows) as they come. Repeat the command to resume.
+Rows go to `experiments/notebooks/which_part.csv` (--rows) as they come. Repeat the command to resume. Use another
+file for other PARAMETERS or --num-samples.
 """
 
 import argparse

@@ -183,3 +183,8 @@ def table(rows: list[dict[str, Any]]) -> str:
     widths = [max(len(line[i]) for line in cells) for i in range(len(names))]
     lines = ["| " + " | ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True)) + " |" for line in cells]
     return "\n".join([lines[0], "|" + "|".join("-" * (width + 1) + ":" for width in widths) + "|", *lines[1:]])
+
+
+def print_last(rows: list[dict[str, Any]]) -> None:
+    """Print the last row of a table that grows, and before the first its header."""
+    print(table(rows) if len(rows) == 1 else table(rows).splitlines()[-1], flush=True)

@@ -14,7 +14,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from common import median_seconds, quick_config, table
+from common import median_seconds, print_last, quick_config, table
 
 import fleetjax
 from fleetjax import envs
@@ -49,7 +49,7 @@ def relaxed(config: fleetjax.Config, args: argparse.Namespace) -> None:
                 "estimate, MiB": f"{estimate / 2**20:,.0f}",
             }
         )
-        print(table(rows[-1:]) if len(rows) == 1 else table(rows).splitlines()[-1], flush=True)
+        print_last(rows)
     print()
 
 

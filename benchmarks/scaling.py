@@ -10,7 +10,7 @@ import argparse
 from typing import Any, NamedTuple
 
 import jax
-from common import REGISTERED, median_seconds, quick_config, step_milliseconds, table
+from common import REGISTERED, median_seconds, print_last, quick_config, step_milliseconds, table
 
 import fleetjax
 from fleetjax.io import scripts
@@ -50,7 +50,7 @@ def robots(sizes: Sizes) -> None:
         time = step_milliseconds(config, num_steps=10)
         name = environment if environment == "navigation" else f"{environment} ({backend})"
         rows.append({"environment": name, "N": n, "ms a timestep": f"{time:.2f}", "us a robot-step": f"{1e3 * time / n:.2f}"})
-        print(table(rows[-1:]) if len(rows) == 1 else table(rows).splitlines()[-1], flush=True)
+        print_last(rows)
 
 
 def humans(sizes: Sizes) -> None:

@@ -15,7 +15,7 @@ of `fleetjax run`.
 """
 
 import argparse
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import jax
@@ -25,8 +25,8 @@ from matplotlib.figure import Figure
 
 import fleetjax
 from fleetjax import statistics
-from fleetjax.config import Config, get_value
-from fleetjax.gradients import final_return
+from fleetjax.config import Config, all_fields, get_value
+from fleetjax.gradients import final_return, within_range
 from fleetjax.io import figure, files, scripts, text
 
 FIELDS = ("uncertainty_threshold", "risk_threshold", "violation_weight", "uncertainty_weight", "risk_weight")
@@ -51,6 +51,12 @@ def relative(config: Config, found: fleetjax.Sensitivity) -> np.ndarray:
 def cosine(a: np.ndarray, b: np.ndarray) -> float:
     """Return the cosine of the angle between two vectors; NaN if one is 0."""
     return float(a @ b / (np.linalg.norm(a) * np.linalg.norm(b))) if np.any(a) and np.any(b) else float("nan")
+
+
+def scaled(config: Config, factors: Mapping[str, float]) -> Config:
+    """Return the configuration with some fields multiplied, each kept within its range."""
+    known = all_fields(config.algorithm)
+    return config.replace(**{name: within_range(known[name], get_value(config, name) * x) for name, x in factors.items()})
 
 
 @jax.jit
@@ -128,9 +134,7 @@ def check_steps(config: Config, directions: dict[str, np.ndarray], seeds: Sequen
     rows: Table = [("step along", "return before", "after", "difference", "95 % interval")]
     for name, direction in directions.items():
         step = np.exp(STEP * direction / max(np.linalg.norm(direction), 1e-12))
-        values = {f: float(get_value(config, f)) * s for f, s in zip(FIELDS, step, strict=True)}
-        values["risk_threshold"] = min(values["risk_threshold"], 1.0)
-        after = np.asarray(final_returns(config.replace(**values), keys), float)
+        after = np.asarray(final_returns(scaled(config, dict(zip(FIELDS, step, strict=True))), keys), float)
         low, high = statistics.mean_bounds(after - before)
         shown = (f"{x:.3f}" for x in (before.mean(), after.mean(), (after - before).mean()))
         rows.append((name, *shown, f"{low:.3f} to {high:.3f}"))

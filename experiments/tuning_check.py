@@ -14,7 +14,7 @@ import itertools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from gradient_check import FIELDS, FLEET, final_returns
+from gradient_check import FIELDS, FLEET, final_returns, scaled
 
 import fleetjax
 from fleetjax import statistics
@@ -31,12 +31,7 @@ GRID = {  # factors of the first values
 def grid(config: Config, number: int) -> list[Config]:
     """Return up to `number` configurations: the middle of the grid first."""
     points = sorted(itertools.product(*GRID.values()), key=lambda point: sum(abs(np.log(factor)) for factor in point))
-
-    def at(point: tuple[float, ...]) -> Config:
-        values = {name: float(get_value(config, name)) * factor for name, factor in zip(GRID, point, strict=True)}
-        return config.replace(**values | {"risk_threshold": min(values["risk_threshold"], 1.0)})
-
-    return [at(point) for point in points[:number]]
+    return [scaled(config, dict(zip(GRID, point, strict=True))) for point in points[:number]]
 
 
 def compare(found: dict[str, Config], keys: jax.Array) -> str:

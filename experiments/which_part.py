@@ -18,6 +18,7 @@ import argparse
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -33,9 +34,18 @@ PARTS = {"violation_weight": "violation", "uncertainty_weight": "uncertainty", "
 STEPS = {"navigation": 500, "humanoid": 1000}
 WIDTH = 0.5  # of the noise, in units of a weight: a tenth would hardly change who is helped
 DERIVATIVE, WHOLE, REMOVED = "derivative", "whole", "removed"  # kinds of rows
-COLUMNS = ("environment", "timesteps", "kind", "part", "seed", "value", "error")
 
-Row = tuple[str, int, str, str, int, float, float]
+
+class Row(NamedTuple):
+    """A row of the file: what a run or a derivative came to, and the standard error of a derivative."""
+
+    environment: str
+    timesteps: int
+    kind: str
+    part: str
+    seed: int
+    value: float
+    error: float
 
 
 def worth(metrics: fleetjax.Metrics, config: Config) -> jax.Array:
@@ -70,7 +80,7 @@ def missing_rows(config: Config, stored: pd.DataFrame, args: argparse.Namespace)
         return bool(np.any(place & (stored["kind"] == kind) & (stored["seed"] == seed)))
 
     def row(kind: str, part: str, seed: int, value: float, error: float = float("nan")) -> Row:
-        return config.environment, config.num_steps, kind, part, seed, value, error
+        return Row(config.environment, config.num_steps, kind, part, seed, value, error)
 
     for seed in range(args.removals):
         if not is_stored(REMOVED, seed):
@@ -114,15 +124,15 @@ def main() -> None:
     parser.add_argument("--num-samples", type=int, default=32, help="shifted runs for each derivative")
     parser.add_argument("--rows", type=Path, default=Path(__file__).parent / "notebooks" / "which_part.csv", metavar="FILE.csv")
     args, given = scripts.parse(parser)
-    stored = pd.read_csv(args.rows) if args.rows.exists() else pd.DataFrame(columns=COLUMNS)
+    stored = pd.read_csv(args.rows) if args.rows.exists() else pd.DataFrame(columns=Row._fields)
     for name in args.environments:
         wanted = {"num_steps": STEPS[name], "initial_period": 0, **dict.fromkeys(PARTS, 1.0)}
         config = fleetjax.make_config(name, "weighted", **wanted | given)
         for rows in missing_rows(config, stored, args):
-            found = pd.DataFrame(rows, columns=COLUMNS)
+            found = pd.DataFrame(rows)
             stored = pd.concat([stored, found], ignore_index=True) if len(stored) else found
             files.write(args.rows, stored.to_csv(index=False, float_format="%.6g").encode())
-            print(f"{name}: {rows[-1][2]}, seed {rows[-1][4]}", flush=True)
+            print(f"{name}: {rows[-1].kind}, seed {rows[-1].seed}", flush=True)
     if len(stored):
         print(show(stored))
 

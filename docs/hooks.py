@@ -1,14 +1,18 @@
-"""What the documentation site adds to its pages: the table of configuration fields, and doctests shown as code."""
+"""What the documentation site adds to its pages: the table of configuration fields, the study's figures, doctests as code."""
 
 import re
+from pathlib import Path
 from typing import Any
 
 import griffe
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
 
 from fleetjax.config import FIELDS, Config
 from fleetjax.io.flags import show
 
 _TABLE = "<!-- table of configuration fields -->"
+_RESULTS = Path(__file__).parents[1] / "experiments" / "results"
 
 
 class Doctests(griffe.Extension):
@@ -21,8 +25,15 @@ class Doctests(griffe.Extension):
 
 
 def on_page_markdown(markdown: str, **kwargs: Any) -> str:
-    """Put the table of configuration fields where a page asks for it."""
-    return markdown.replace(_TABLE, _fields())
+    """Put the table of configuration fields where a page asks for it, and find the study's figures where the site has them."""
+    return markdown.replace(_TABLE, _fields()).replace("../experiments/results/", "results/")
+
+
+def on_files(files: Files, *, config: MkDocsConfig) -> Files:
+    """Add the study's figures, which lie outside of the pages' folder."""
+    for path in sorted(_RESULTS.glob("*.png")):
+        files.append(File.generated(config, f"results/{path.name}", abs_src_path=str(path)))
+    return files
 
 
 def _fields() -> str:

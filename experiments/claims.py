@@ -288,15 +288,19 @@ def number(x: float) -> str:
     return f"{x:,.0f}" if abs(x) >= 100 else f"{x:.3g}"
 
 
+def verdicts(study: Study) -> str:
+    """Return the table of all claims."""
+    table = [cells(claim, *judge(study, claim)) for claim in (*of_main(), *of_appendix())]
+    return text.markdown_table([("claim", "verdict", "decided by", "difference", "seeds"), *table])
+
+
 def main() -> None:
     """Print or write the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--results", type=Path, default=HERE / "results", help="folder of the rows")
     parser.add_argument("--output", type=Path, help="Markdown file [default: print]")
     args = parser.parse_args()
-    study = Study(args.results)
-    table = [cells(claim, *judge(study, claim)) for claim in (*of_main(), *of_appendix())]
-    content = text.markdown_table([("claim", "verdict", "decided by", "difference", "seeds"), *table]) + "\n"
+    content = verdicts(Study(args.results)) + "\n"
     if args.output:
         files.write(args.output, content.encode())
     else:

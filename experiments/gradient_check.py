@@ -30,9 +30,11 @@ from fleetjax.gradients import final_return, within_range
 from fleetjax.io import figure, files, scripts, text
 
 FIELDS = ("uncertainty_threshold", "risk_threshold", "violation_weight", "uncertainty_weight", "risk_weight")
-FLEET = {"num_robots": 20, "num_humans": 2, "num_steps": 300, "initial_period": 0, "critic_capacity": 10_000}
+FLEET = {"num_robots": 20, "num_humans": 5, "num_steps": 300, "initial_period": 0, "critic_capacity": 10_000}
+START = {"uncertainty_threshold": 0.15}  # above the best: with it humans are sometimes free, and the return depends on it
 TEMPERATURES = (1.0, 0.3, 0.1, 0.03, 0.01)
 LENGTHS = (30, 100, 300, 1000)
+STEPPED = (1.0, 0.1)  # temperatures of the relaxed gradients along which `steps` goes
 SHORT = (3, 10, 30, 100)  # of finite differences
 WIDTH = 0.5  # of the noise in smoothed gradients, in units of each field; less leaves more noise than slope
 STEP = 0.3  # by which a step changes the logarithms of all fields, as a vector
@@ -63,6 +65,12 @@ def scaled(config: Config, factors: Mapping[str, float]) -> Config:
 def relaxed(config: Config, keys: jax.Array) -> fleetjax.Sensitivity:
     """Return the relaxed sensitivity."""
     return fleetjax.sensitivity(config, keys, FIELDS, method="relaxed")
+
+
+def relaxed_at(config: Config, keys: jax.Array, temperature: float) -> np.ndarray:
+    """Return f64[S, F], the relaxed gradient of each seed."""
+    config = config.replace(temperature=temperature)
+    return np.array([relative(config, relaxed(config, key[None])) for key in keys])
 
 
 @jax.jit
@@ -105,12 +113,11 @@ def check_differences(config: Config, keys: jax.Array, lengths: Sequence[int]) -
     return rows
 
 
-def by_temperature(config: Config, keys: jax.Array, reference: np.ndarray) -> tuple[Table, list[tuple[float, float]]]:
-    """Compare relaxed gradients with the smoothed one, by temperature; return also the cosine of each temperature."""
+def by_temperature(slopes: dict[float, np.ndarray], reference: np.ndarray) -> tuple[Table, list[tuple[float, float]]]:
+    """Compare relaxed gradients f64[S, F] with the smoothed one, by temperature; return also the cosine of each temperature."""
     rows: Table = [("temperature", "cosine", "equal signs", "cosine of one seed, median", "norm")]
     curve = []
-    for temperature in TEMPERATURES:
-        each = np.array([relative(config, relaxed(config.replace(temperature=temperature), key[None])) for key in keys])
+    for temperature, each in slopes.items():
         mean = each.mean(axis=0)
         alone = [angle for one in each if not np.isnan(angle := cosine(one, reference))]
         curve.append((temperature, cosine(mean, reference)))
@@ -146,8 +153,8 @@ def by_length(config: Config, keys: jax.Array, lengths: Sequence[int]) -> tuple[
     rows: Table = [("timesteps", "median norm", "largest norm")]
     curve = []
     for length in lengths:
-        longer = config.replace(num_steps=length, temperature=TEMPERATURES[1])
-        norms = [np.linalg.norm(relative(config, relaxed(longer, key[None]))) for key in keys]
+        longer = config.replace(num_steps=length)
+        norms = np.linalg.norm(relaxed_at(longer, keys, TEMPERATURES[1]), axis=1)
         curve.append((length, float(np.median(norms))))
         rows.append((str(length), f"{np.median(norms):.2g}", f"{max(norms):.2g}"))
     return rows, curve
@@ -179,7 +186,7 @@ def main() -> None:
     parser.add_argument("--differences", type=int, nargs="+", default=SHORT, help="timesteps for `differences`")
     parser.add_argument("--output", type=Path, help="figure")
     args, given = scripts.parse(parser)
-    config = fleetjax.make_config("navigation", "weighted", **FLEET | given)
+    config = fleetjax.make_config("navigation", "weighted", **FLEET | START | given)
     keys, wanted, curves = jax.random.split(jax.random.key(0), args.seeds), args.checks, {}
     reference = np.zeros(len(FIELDS))
 
@@ -195,14 +202,14 @@ def main() -> None:
         errors = [float(found.standard_error[name] * get_value(config, name)) for name in FIELDS]
         table = [(f, f"{x:.3f}", f"{e:.3f}") for f, x, e in zip(FIELDS, reference, errors, strict=True)]
         show("Smoothed gradient", [("by the logarithm of", "gradient", "standard error"), *table])
+    wanted_at = TEMPERATURES if "temperature" in wanted else STEPPED if "steps" in wanted else ()
+    slopes = {t: relaxed_at(config, keys, t) for t in wanted_at}
     if "temperature" in wanted:
-        table, curves["cosine with the smoothed gradient, by temperature"] = by_temperature(config, keys, reference)
+        table, curves["cosine with the smoothed gradient, by temperature"] = by_temperature(slopes, reference)
         show("Relaxed and smoothed gradients", table)
     if "steps" in wanted:
         directions = {"the smoothed gradient": reference, "the opposite direction": -reference}
-        for temperature in (TEMPERATURES[0], TEMPERATURES[2]):
-            slopes = relative(config, relaxed(config.replace(temperature=temperature), keys))
-            directions[f"the relaxed one, temperature {temperature:g}"] = slopes
+        directions |= {f"the relaxed one, temperature {t:g}": slopes[t].mean(axis=0) for t in STEPPED}
         show("Steps", check_steps(config, directions, range(1000, 1000 + args.fresh)))
     if "length" in wanted:
         table, curves["norm of the relaxed gradient, by timesteps"] = by_length(config, keys, args.lengths)

@@ -79,6 +79,22 @@ def test_the_legend_tells_what_each_band_is(config):
     assert [entry.get_text() for entry in legend.get_texts()] == ["C.U.R. (5 seeds)", "U.C. (2 seeds)"]
 
 
+def test_the_legend_names_a_label_once_whatever_its_numbers_of_seeds(config):
+    elsewhere = fleetjax.make_config("block_push", "cur")
+    runs = [(config, seed, make_metrics(seed)) for seed in range(3)] + [(elsewhere, 0, make_metrics())]
+    legend = figure.plot(runs).legends[0]
+    assert [entry.get_text() for entry in legend.get_texts()] == ["C.U.R. (1 to 3 seeds)"]
+
+
+def test_counts_of_different_size_are_told_apart_even_beside_zero(config):
+    few, many = make_metrics(0), make_metrics(0)._replace(violations=20 * make_metrics(0).violations)
+    none = make_metrics(0)._replace(violations=0 * make_metrics(0).violations, successes=0 * make_metrics(0).successes)
+    rules = [config, *(fleetjax.make_config("navigation", name) for name in ("uc", "c"))]
+    axes = figure.draw(figure.group([(rule, 0, metrics) for rule, metrics in zip(rules, (few, many, none), strict=True)])).axes
+    assert [ax.get_yscale() for ax in axes] == ["linear", "log", "linear", "linear"]
+    assert 0 < axes[1].get_ylim()[0] < few.violations.sum()
+
+
 def test_returns_of_different_size_are_told_apart(config):
     few, many = make_metrics(0), make_metrics(0)._replace(successes=20 * make_metrics(0).successes)
     returns = [figure.curves_of(metrics, config)[3, -1] for metrics in (few, many)]

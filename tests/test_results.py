@@ -1,5 +1,6 @@
 """What is committed of the study: its tables are those of its rows."""
 
+import re
 import shutil
 import subprocess
 import sys
@@ -39,3 +40,13 @@ def test_rows_are_those_of_whole_runs(part):
         assert run.timesteps[-1] == run.config.num_steps
         assert run.processor
         assert run.versions["fleetjax"]
+
+
+@pytest.mark.slow
+def test_the_page_shows_the_stored_rows(tmp_path):
+    page = ROOT / "docs" / "results.md"
+    without = re.sub(r"(?s)(<!-- (\w+) -->\n).*?(<!-- end -->)", r"\1\3", page.read_text())
+    (tmp_path / "results.md").write_text(without)
+    subprocess.run([sys.executable, ROOT / "experiments" / "page.py", "--page", tmp_path / "results.md"], check=True)
+    assert without.count("<!-- end -->") == 4
+    assert (tmp_path / "results.md").read_text() == page.read_text()

@@ -116,10 +116,10 @@ def _kind(seeds: int) -> str:
 
 def _values(one: Group, metric: str) -> dict[int, float]:
     """Return what the runs of a group achieved, by seed."""
-    return {seed: _value(run, metric) for seed, run in one.runs.items()}
+    return {seed: value(run, metric) for seed, run in one.runs.items()}
 
 
-def _value(run: Outcome, metric: str) -> float:
+def value(run: Outcome, metric: str) -> float:
     """Return what a run achieved.
 
     Raises:
@@ -128,10 +128,10 @@ def _value(run: Outcome, metric: str) -> float:
     total = text.add_up(run.metrics)
     if metric == "rohe_with_demonstrations":
         total["human_steps"] += float(run.config.extra_demonstrations)
-    value = total[metric] if metric in total else text.rohe_of(total, run.config)
-    if not math.isfinite(value):
+    found = total[metric] if metric in total else text.rohe_of(total, run.config)
+    if not math.isfinite(found):
         raise ValueError(f"{run.name} has no {metric}; choose another --metric")
-    return value
+    return found
 
 
 def _references(groups: Sequence[Group], against: str | None) -> dict[str, Group]:

@@ -138,7 +138,7 @@ def draw(groups: Sequence[Curves], title: str = "") -> Figure:
         places = list(dict.fromkeys(curves.environment for curves in groups))
         figure = Picture(figsize=(12.5, 0.5 + 2.6 * len(places)), layout=ConstrainedLayoutEngine(w_pad=0.12))
         axes = figure.subplots(len(places), len(PANELS), squeeze=False)
-        numbers = {len(curves.values) for curves in groups}
+        labels = _labels(groups)
         legend: dict[str, Line2D] = {}
         styles = _styles(groups)
         for row, place in zip(axes, places, strict=True):
@@ -147,8 +147,7 @@ def draw(groups: Sequence[Curves], title: str = "") -> Figure:
                 _prepare_axes(ax, name)
                 for curves, (colour, dashes) in here:
                     seeds = curves.values[:, panel]
-                    label = f"{curves.label} ({text.plural(len(seeds), 'seed')})" if len(numbers) > 1 else curves.label
-                    t = curves.timesteps
+                    t, label = curves.timesteps, labels[curves.label]
                     (line,) = ax.plot(t, seeds.mean(axis=0), color=colour, linestyle=dashes, linewidth=1.8, label=label)
                     legend.setdefault(label, line)
                     if len(seeds) > 1:
@@ -157,19 +156,31 @@ def draw(groups: Sequence[Curves], title: str = "") -> Figure:
                         ax.fill_between(t[kept], low, high, color=colour, alpha=0.2, linewidth=0)
                 ax.set_xlim(0, max(curves.timesteps[-1] for curves, _ in here))
                 ax.set_ylim(bottom=0)
-            _spread_returns(row[-1], [curves.values[:, -1, -1].mean() for curves, _ in here])
+                if name != PANELS[0]:
+                    _spread(ax, [curves.values[:, panel, -1].mean() for curves, _ in here])
             if len(places) > 1:
                 row[0].set_ylabel(place, fontsize=10)
         if title:  # it says what the only line is
             figure.suptitle(title, x=0.008, ha="left", fontsize=11)
         else:
-            labels = list(legend)
-            columns = max(1, min(len(labels), _LEGEND_WIDTH // (7 + max(map(len, labels)))))
+            shown = list(legend)
+            columns = max(1, min(len(shown), _LEGEND_WIDTH // (7 + max(map(len, shown)))))
             figure.legend(
-                list(legend.values()), labels, loc="outside upper left", ncols=columns, alignment="left", title=_note(groups)
+                list(legend.values()), shown, loc="outside upper left", ncols=columns, alignment="left", title=_note(groups)
             )
-            figure.set_figheight(figure.get_figheight() + 0.24 * -(-len(labels) // columns))
+            figure.set_figheight(figure.get_figheight() + 0.24 * -(-len(shown) // columns))
     return figure
+
+
+def _labels(groups: Sequence[Curves]) -> dict[str, str]:
+    """Return each label as the legend shows it: with the number of seeds (fewest to most), if not all have as many."""
+    numbers: dict[str, list[int]] = {}
+    for curves in groups:
+        numbers.setdefault(curves.label, []).append(len(curves.values))
+    if len({number for of_label in numbers.values() for number in of_label}) == 1:
+        return {label: label for label in numbers}
+    fewest = {label: f"{min(of_label)} to " if min(of_label) < max(of_label) else "" for label, of_label in numbers.items()}
+    return {label: f"{label} ({fewest[label]}{text.plural(max(of_label), 'seed')})" for label, of_label in numbers.items()}
 
 
 def _note(groups: Sequence[Curves]) -> str:
@@ -195,11 +206,12 @@ def _prepare_axes(ax: Axes, name: str) -> None:
         ax.yaxis.set_major_formatter(counts)
 
 
-def _spread_returns(ax: Axes, ends: Sequence[float]) -> None:
-    """Give the returns a logarithmic axis where the lower ones would lie on a linear one's bottom."""
-    if 0 < 10 * min(ends) < max(ends):
+def _spread(ax: Axes, ends: Sequence[float]) -> None:
+    """Give a panel a logarithmic axis where the lower curves would lie on a linear one's bottom; those at 0 do not show."""
+    above = [end for end in ends if end > 0]
+    if above and 10 * min(above) < max(above):
         ax.set_yscale("log")
-        ax.set_ylim(min(ends) / 10, 2 * max(ends))
+        ax.set_ylim(min(above) / 10, 2 * max(above))
 
 
 def _styles(groups: Sequence[Curves]) -> list[tuple[str, Any]]:

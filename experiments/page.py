@@ -1,0 +1,109 @@
+"""Fill in the tables of `docs/results.md` from the stored rows of the study; no simulation.
+
+    python experiments/page.py [--results experiments/results] [--page docs/results.md]
+
+A table stands between `<!-- NAME -->` and `<!-- end -->`, where NAME is one of:
+
+- `main`, `gradient_steps`: what the algorithms achieved in that part, each robot's one after the other.
+- `claims`: the verdicts of `claims.py`.
+- `missing`: how many runs of each part are stored, of how many.
+"""
+
+import argparse
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import claims
+import numpy as np
+import paper
+
+from fleetjax.io import comparing, files, rows, text
+from fleetjax.io.outcomes import Group, group
+from fleetjax.io.study import plan
+
+PUBLISHED = {  # successes of the trained policies (paper, Appendix); Fleet-TD is the hand's only
+    "humanoid": {"constraint": 0, "random": 746.3, "ensemble_dagger": 617.7, "cur": 771.0, "expert": 894},
+    "anymal": {"constraint": 32.7, "random": 207.3, "ensemble_dagger": 257.3, "cur": 257.0, "expert": 293},
+    "allegro_hand": {
+        "constraint": 70.0,
+        "random": 7360.3,
+        "ensemble_dagger": 3032.0,
+        "thrifty_dagger": 4296.3,
+        "cur": 6032.7,
+        "expert": 21609,
+    },
+}
+COLUMNS = {"successes": "successes", "violations": "violations", "human_steps": "human time", "rohe": "ROHE"}
+
+
+def mean(one: Group, metric: str, *, spread: bool = False) -> str:
+    """Return the mean of a metric over seeds, with the smallest and the largest if asked for."""
+    values = np.array([comparing.value(run, metric) for run in one.runs.values()])
+    shown = claims.number(values.mean())
+    return f"{shown} ({claims.number(values.min())} to {claims.number(values.max())})" if spread and len(values) > 1 else shown
+
+
+def achieved(found: list[Group], alone: Mapping[str, Group]) -> str:
+    """Return a table of what groups of runs achieved, and of what their policies did `alone`, by name."""
+    head = ["", "seeds", *COLUMNS.values(), "ROHE, demonstrations counted"]
+    policies = ["policy alone: successes", "violations", "successes in the paper"] if alone else []
+    table = [tuple(head + policies)]
+    for one in sorted(found, key=lambda one: [*claims.NAMES].index(one.config.environment)):
+        place, algorithm = one.config.environment, one.config.algorithm
+        cells = [f"{claims.NAMES[place]}, {one.label}", str(len(one.runs))]
+        cells += [mean(one, metric, spread=metric == "successes") for metric in COLUMNS]
+        cells += [mean(one, "rohe_with_demonstrations") if "constraint" in algorithm else ""]
+        if alone:
+            policy = alone.get(f"{place} {one.label}")
+            paper_value = PUBLISHED.get(place, {}).get(algorithm)
+            cells += [mean(policy, "successes"), mean(policy, "violations")] if policy else ["", ""]
+            cells += ["" if paper_value is None else claims.number(paper_value)]
+        table.append(tuple(cells))
+    return text.markdown_table(table)
+
+
+def groups(results: Path, part: str) -> list[Group]:
+    """Return the groups of a part's stored runs."""
+    path = results / f"{part}{rows.SUFFIX}"
+    return group(rows.read(path)) if path.exists() else []
+
+
+def missing(args: argparse.Namespace) -> str:
+    """Return a table of the runs that are stored of each part, and of all that it has."""
+    table = [("part", "runs stored", "of", "command")]
+    for name in paper.PARTS:
+        part = paper.Part(name, args)
+        source = paper.Part(paper.TRAINED, args) if name == "policies" else part
+        table.append((name, str(len(part.rows())), str(len(plan(source.study()))), f"`python experiments/paper.py {name}`"))
+    return text.markdown_table(table)
+
+
+def main() -> None:
+    """Write the page anew."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--results", type=Path, default=paper.HERE / "results", help="folder of the rows")
+    parser.add_argument("--page", type=Path, default=paper.HERE.parent / "docs" / "results.md", help="Markdown file")
+    args = parser.parse_args()
+    alone = {f"{one.config.environment} {one.label}": one for one in groups(args.results, "policies")}
+    every = argparse.Namespace(
+        results=args.results, studies=paper.HERE / "studies", seeds=None, workers=1, output=Path("runs/paper")
+    )
+    tables = {
+        "main": achieved(groups(args.results, "main"), alone),
+        "gradient_steps": achieved(groups(args.results, "gradient_steps"), {}),
+        "claims": claims.verdicts(claims.Study(args.results)),
+        "missing": missing(every),
+    }
+    page = args.page.read_text()
+    for name, table in tables.items():
+        page, found = re.subn(rf"(<!-- {name} -->\n)(?s:.*?)(<!-- end -->)", lambda m, t=table: f"{m[1]}\n{t}\n\n{m[2]}", page)
+        files.expect(
+            found == 1, f"{args.page} has {found} tables {name!r}; it must have one, from <!-- {name} --> to <!-- end -->"
+        )
+    files.write(args.page, page.encode())
+    print(args.page)
+
+
+if __name__ == "__main__":
+    main()

@@ -2,7 +2,7 @@
 
     python benchmarks/gradients.py [relaxed|smoothed ...] [--lengths 100 300 1000] [--num-samples 16] [-- PARAMETERS]
 
-- `relaxed`: the objective of a soft fleet alone, and with its gradient by two fields, by the length of the run; the memory of
+- `relaxed`: the objective of a soft fleet alone, and with its gradient for two fields, by the length of the run; the memory of
   the compiled gradient, and the estimate by which `sensitivity` refuses runs that are too long.
 - `smoothed`: shifted runs a second, beside as many plain runs in a `lax.map`.
 

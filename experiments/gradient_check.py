@@ -46,7 +46,7 @@ Table = list[tuple[str, ...]]
 
 
 def relative(config: Config, found: fleetjax.Sensitivity) -> np.ndarray:
-    """Return f64[F], the derivatives by the logarithms of the fields."""
+    """Return f64[F], the derivatives with respect to the logarithms of the fields."""
     return np.array([float(found.gradient[name] * get_value(config, name)) for name in FIELDS])
 
 
@@ -201,7 +201,7 @@ def main() -> None:
         reference = relative(config, found)
         errors = [float(found.standard_error[name] * get_value(config, name)) for name in FIELDS]
         table = [(f, f"{x:.3f}", f"{e:.3f}") for f, x, e in zip(FIELDS, reference, errors, strict=True)]
-        show("Smoothed gradient", [("by the logarithm of", "gradient", "standard error"), *table])
+        show("Smoothed gradient", [("field", "gradient", "standard error"), *table])
     wanted_at = TEMPERATURES if "temperature" in wanted else STEPPED if "steps" in wanted else ()
     slopes = {t: relaxed_at(config, keys, t) for t in wanted_at}
     if "temperature" in wanted:

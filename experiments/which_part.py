@@ -1,11 +1,11 @@
-"""Which part of C.U.R. matters, and by how much: derivatives by the weights of its parts, and runs without a part.
+"""Which part of C.U.R. matters, and by how much: derivatives with respect to the weights of its parts, and runs without a part.
 
     python experiments/which_part.py [ENV ...] [--seeds 3] [--removals 10] [--num-samples 32] [-- PARAMETERS]
 
 The parts are violations, uncertainty and risk. The rule is not C.U.R. itself, which is an order, but
 `weighted`, with all weights 1 and without an initial period.
 
-For each of --seeds there is the smoothed derivative of the return on human effort by the logarithm of each weight
+For each of --seeds there is the smoothed derivative of the return on human effort with respect to the logarithm of each weight
 (`fleetjax.sensitivity`). For each of --removals there is a whole run, and one without each part, trained anew. An episode
 on Humanoid takes 999 timesteps, so a run of 1,000 has almost no successes: there rewards stand for them, in units of the return
 that a success needs. PARAMETERS are those of `fleetjax run`.
@@ -57,7 +57,7 @@ def worth(metrics: fleetjax.Metrics, config: Config) -> jax.Array:
 
 @partial(jax.jit, static_argnames="num_samples")
 def derivatives(config: Config, key: jax.Array, num_samples: int) -> dict[str, tuple[jax.Array, jax.Array]]:
-    """Return for each part f32[] the derivative of the return by the logarithm of its weight, and f32[] its error."""
+    """Return for each part f32[] the derivative of the return with respect to the log of its weight, and f32[] its error."""
     weights = {name: get_value(config, name) for name in PARTS}
     width = {name: WIDTH * weight for name, weight in weights.items()}
     found = fleetjax.sensitivity(config, key, list(PARTS), objective=worth, num_samples=num_samples, width=width)
@@ -102,7 +102,7 @@ def show(rows: pd.DataFrame) -> str:
         return f"{values.mean():.3f} ({low:.3f} to {high:.3f})"
 
     table: list[tuple[str, ...]] = [
-        ("environment", "part", "derivative by log weight", "change without the part", "return with all parts")
+        ("environment", "part", "derivative, log weight", "change without the part", "return with all parts")
     ]
     for place, found in rows.groupby("environment", sort=False):
         kind, own = found["kind"].to_numpy(), found["part"].to_numpy()

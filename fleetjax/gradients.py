@@ -226,7 +226,7 @@ def _as_keys(keys: jax.Array) -> jax.Array:
 
 
 def _check_fields(config: Config, names: Sequence[str], method: str) -> None:
-    """Check that there are derivatives by these fields."""
+    """Check that these fields can be differentiated."""
     known = all_fields(config.algorithm)
     if not names or len(set(names)) < len(names):
         raise ValueError(f"fields = {list(names)} must name one or more fields, each once")
@@ -234,7 +234,7 @@ def _check_fields(config: Config, names: Sequence[str], method: str) -> None:
         config.replace(**{name: get_value(config, name)} if name in known else {name: 0})  # an unknown name is refused
         field = known[name]
         if not field.traced or field.kind is bool:
-            raise ValueError(f"field {name} is {'static' if not field.traced else 'a switch'}; there is no derivative by it")
+            raise ValueError(f"field {name} is {'static' if not field.traced else 'a switch'}; it has no derivative")
         if name in OFFLINE:
             raise ValueError(f"field {name} acts only before t = 0, and the fleet at t = 0 is held fixed; omit it")
         if field.kind is int and method != "smoothed":

@@ -27,7 +27,7 @@ _KNOWN = {
     "expert": ("Expert", "every robot is teleoperated and nothing is learnt: an upper bound on successes"),
     "weighted": (
         "Weighted sum",
-        "as cur, but by a weighted sum of violation, uncertainty and risk: for derivatives by the weights",
+        "as cur, but by a weighted sum of violation, uncertainty and risk: whose weights can be differentiated",
     ),
     "cur": ("C.U.R.", "robots in violation first, then by uncertainty, then by risk: the paper's proposal"),
 }

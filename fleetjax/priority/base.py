@@ -42,7 +42,7 @@ class Algorithm:
         optional: those of the estimators that are left out where the environment has no goals.
         defaults: `config -> fields` of `Config` whose defaults it overrides.
         check: `(config, EnvSpec) -> None` raises ValueError for a configuration that it cannot use.
-        differentiable: whether scores have derivatives by its parameters, as weighted sums do and ranks do not; the soft
+        differentiable: whether scores have derivatives with respect to its parameters, as weighted sums do and ranks do not; the soft
             allocation needs it.
         sees_supervisor: whether `Signals.human_action` is filled, for upper bounds that no real fleet could reach.
         pretrains: whether demonstrations are collected and the policy is cloned before the fleet starts.
@@ -91,7 +91,7 @@ def register_priority(
         make_priority: `config -> Priority`.
         estimators: registered names of what it reads: `"safety"` for `Signals.risk`, `"goal"` for `Signals.goal`.
         parameters: what this algorithm alone has, by name.
-        differentiable: whether its scores have derivatives by its parameters; see `Algorithm`.
+        differentiable: whether its scores have derivatives with respect to its parameters; see `Algorithm`.
 
     Raises:
         ValueError: if the name is taken.

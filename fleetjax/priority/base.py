@@ -42,8 +42,8 @@ class Algorithm:
         optional: those of the estimators that are left out where the environment has no goals.
         defaults: `config -> fields` of `Config` whose defaults it overrides.
         check: `(config, EnvSpec) -> None` raises ValueError for a configuration that it cannot use.
-        differentiable: whether scores have derivatives with respect to its parameters, as weighted sums do and ranks do not; the soft
-            allocation needs it.
+        differentiable: whether scores have derivatives with respect to its parameters, as weighted sums do and ranks do not;
+            the soft allocation needs it.
         sees_supervisor: whether `Signals.human_action` is filled, for upper bounds that no real fleet could reach.
         pretrains: whether demonstrations are collected and the policy is cloned before the fleet starts.
         updates: whether human data are recorded and learnt from while the fleet runs.

@@ -181,6 +181,17 @@ BAD = {
     "workers": ((NAV, "--workers", 0), "workers = 0 must be at least 1"),
     "checkpoints": ((NAV, "--checkpoint-every", 1), "checkpoint_every = 1 must be 0 (none) or at least 2"),
     "memory": ((NAV, "--hidden-sizes", 8, "8,1000000000", 1000000000), "hidden_sizes = (1000000000, 1000000000) is too large"),
+    "launcher": ((NAV, "--launcher", "condor"), "invalid choice: 'condor' (choose from"),
+    "jobs without": ((NAV, "--jobs", 2), "jobs is an option of a launcher; add launcher = 'slurm', or omit it"),
+    "no jobs": ((NAV, "--launcher", "local", "--jobs", 0), "jobs = 0 must be at least 1"),
+    "lease": ((NAV, "--launcher", "local", "--lease", 0), "lease = 0 must be at least 1 second"),
+    "both": ((NAV, "--launcher", "local", "--workers", 2), "workers are processes of this machine; with a launcher, give jobs"),
+    "partition": (
+        (NAV, "--launcher", "local", "--slurm-partition", "gpu"),
+        "slurm_partition is an option of launcher = 'slurm'",
+    ),
+    "time": ((NAV, "--launcher", "slurm", "--slurm-time", 5), "slurm_time = 5 must be at least 15 minutes"),
+    "no cluster": ((NAV, "--launcher", "slurm"), "launcher = 'slurm' needs SLURM, and this machine has no srun"),
     "files": (("a.toml", "b.toml"), "a.toml and b.toml are two files"),
     "no file": (("nowhere.toml",), "nowhere.toml does not exist"),
 }
@@ -489,6 +500,64 @@ def test_kills_of_workers_and_of_all_lose_nothing(tmp_path, spawn, whole):
     assert [results(the_run(output, seed)) for seed in range(3)] == [whole[seed] for seed in range(3)]
     for seed in (0, 2):
         assert "resuming from" in (output / "logs" / f"navigation-random-seed{seed}.log").read_text()
+
+
+def test_a_launcher_needs_submitit(capsys, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "submitit", None)
+    said = refused(capsys, "sweep", "navigation", "--launcher", "local", "--output", tmp_path / "out")
+    assert 'needs submitit; install it: pip install "fleetjax[cluster]"' in said
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_jobs_of_a_cluster_take_over_what_dead_ones_leave(tmp_path, spawn, whole):
+    output = tmp_path / "out"
+    jobs = ("--launcher", "local", "--jobs", 4, "--lease", 3)
+    process = spawn("sweep", "navigation", *RANDOM, "--seeds", 6, *jobs, "--output", output)
+    with contextlib.ExitStack() as stack:
+        stack.callback(process.kill)
+        killed = []
+        for victim in (0, 1):
+            wait_until(lambda victim=victim: rows(the_run(output, victim)) > 200, process)
+            if rows(the_run(output, victim)) < STEPS:
+                killed.append(owner(the_run(output, victim)))
+                os.kill(killed[-1], signal.SIGKILL)
+        code, _, said = end(process)
+    assert code == 0, said
+    assert len(set(killed)) == 2
+    assert [results(the_run(output, seed)) for seed in range(3)] == [whole[seed] for seed in range(3)]
+    for seed in range(6):
+        leases = sorted((output / "leases" / f"navigation-random-seed{seed}").iterdir())
+        ends = [json.loads(path.read_text())["end"] for path in leases]
+        assert ends == (["", "finished"] if seed < 2 else ["finished"])
+    owners = {json.loads(path.read_text())["owner"][1] for path in (output / "leases").glob("*/*")}
+    assert 2 < len(owners) <= 4
+    for seed in (0, 1):
+        assert "resuming from" in (output / "logs" / f"navigation-random-seed{seed}.log").read_text()
+
+
+@pytest.mark.slow
+def test_stopped_jobs_write_checkpoints_and_the_same_command_resumes(tmp_path, spawn):
+    output, steps = tmp_path / "out", 20 * STEPS
+    jobs = ("--launcher", "local", "--jobs", 2, "--lease", 30, "--checkpoint-every", 0)
+    command = ("sweep", "navigation", *RANDOM, "--num-steps", steps, "--seeds", 3, *jobs, "--output", output)
+    process = spawn(*command)
+    with contextlib.ExitStack() as stack:
+        stack.callback(process.kill)
+        wait_until(lambda: rows(the_run(output, 0)) > 200, process)
+        working = owner(the_run(output, 0))
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+        code, _, said = end(process)
+    assert code == 130
+    assert said[-1] == "fleetjax: interrupted with 0 of 3 runs finished; repeat the command to resume"
+    wait_for_end([working])
+    assert 200 < rows(the_run(output, 0)) < steps
+    assert list(the_run(output, 0).glob("checkpoints/*/manifest.json"))
+    assert json.loads((output / "leases" / "navigation-random-seed0" / "0").read_text())["end"] == "stopped"
+    code, _, said = end(spawn(*command))
+    assert code == 0, said
+    assert [rows(the_run(output, seed)) for seed in range(3)] == [steps] * 3
+    assert "resuming from" in (output / "logs" / "navigation-random-seed0.log").read_text()
 
 
 @pytest.mark.slow

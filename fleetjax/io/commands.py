@@ -19,6 +19,7 @@ from fleetjax.field import FIELDS, every_field, owners_in_words
 from fleetjax.io import (
     calibration,
     chunks,
+    cluster,
     export,
     files,
     flags,
@@ -134,6 +135,7 @@ def run_sweep(arguments: argparse.Namespace) -> None:
         resumable.check_interval(asked.checkpoint_every)
         runs = study.plan(asked)
         sweep.check_folder(asked, runs)
+        cluster.check(asked.launcher)
     sweep.run_all(asked, runs)
 
 

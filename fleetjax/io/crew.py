@@ -30,7 +30,7 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         self.cores, (self.pipe, end) = cores, context.Pipe()
         self.process = context.Process(target=worker.work, args=(end, cores, checkpoint_every, logs), daemon=True)
-        with _deaf_to_ctrl_c():
+        with deaf_to_ctrl_c():
             self.process.start()
         end.close()
         self.run: Run | None = None
@@ -52,7 +52,7 @@ class _Worker:
 
 
 @contextlib.contextmanager
-def _deaf_to_ctrl_c() -> Iterator[None]:
+def deaf_to_ctrl_c() -> Iterator[None]:
     """Let a process that is started meanwhile ignore Ctrl-C, which a terminal sends to all: its parent tells it to stop."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:

@@ -17,6 +17,7 @@ from fleetjax.io.lists import listed, sizes
 from fleetjax.registry import unknown
 from fleetjax.version import VERSION
 
+LAUNCHERS = ("local", "slurm")
 LARGEST_SEED = 2**32 - 1  # JAX folds larger ones onto these
 _LARGEST = 2**31 - 1
 _RUNS = "run folder, folder that holds run folders, or file that `fleetjax compare --rows` wrote"
@@ -231,6 +232,14 @@ def _add_sweep(commands: Any, environment: str | None) -> None:
     sweep.add_argument("--output", metavar="DIR", type=Path, help="folder for the run folders", **options)
     workers = "processes, which share the cores [default: one for each core]"
     sweep.add_argument("--workers", metavar="W", type=_integer, help=workers, **options)
+    launcher = "who starts jobs, each with a core: this machine, or a cluster's scheduler [default: --workers processes]"
+    sweep.add_argument("--launcher", choices=LAUNCHERS, help=launcher, **options)
+    sweep.add_argument("--jobs", metavar="J", type=_integer, help="jobs of the launcher [default: 1]", **options)
+    sweep.add_argument("--slurm-partition", metavar="P", help="partition of the cluster [default: its own]", **options)
+    term = "seconds without a sign of life after which another job takes over a job's run [default: 120]"
+    sweep.add_argument("--lease", metavar="S", type=_integer, help=term, **options)
+    minutes = "minutes after which the scheduler stops and requeues a job [default: 1440]"
+    sweep.add_argument("--slurm-time", metavar="MIN", type=_integer, help=minutes, **options)
     every = "timesteps between the checkpoints of a run; 0 = none [default: 1000]"
     sweep.add_argument("--checkpoint-every", metavar="N", type=_integer, help=every, **options)
     logged = "log what teleoperating humans see and do, for `fleetjax export`"

@@ -20,13 +20,42 @@ from fleetjax.envs import list_envs
 from fleetjax.field import every_field, owners
 from fleetjax.io import folder, plain
 from fleetjax.io.files import expect
-from fleetjax.io.flags import LARGEST_SEED
+from fleetjax.io.flags import LARGEST_SEED, LAUNCHERS
 from fleetjax.registry import unknown
 
 Block = Mapping[str, list[Any]]
 _MOST_SEEDS = 100_000
-_OPTIONS: Mapping[str, type] = {"output": str, "workers": int, "checkpoint_every": int, "log_interventions": bool}
+_LEASE = 120  # seconds; NFS shows others' files with up to 60 s delay
+_MINUTES = 24 * 60  # of a job
+_SHORTEST = 15  # minutes; of which the scheduler's warning takes the last ones
+_OF_LAUNCHER: Mapping[str, type] = {"jobs": int, "lease": int, "slurm_partition": str, "slurm_time": int}
+_OPTIONS: Mapping[str, type] = {
+    "output": str,
+    "workers": int,
+    "checkpoint_every": int,
+    "log_interventions": bool,
+    "launcher": str,
+    **_OF_LAUNCHER,
+}
 _SUFFIX = ".toml"
+
+
+class Launcher(NamedTuple):
+    """Who starts the processes of a sweep that are not its own.
+
+    Attributes:
+        kind: "local": this machine; "slurm": the cluster's scheduler.
+        jobs: number of processes, each with one core.
+        lease: seconds without a sign of life after which another job takes over a job's run.
+        partition: of the cluster; "" = its default.
+        minutes: that a job may take before the scheduler stops and requeues it.
+    """
+
+    kind: str
+    jobs: int
+    lease: int
+    partition: str
+    minutes: int
 
 
 class Study(NamedTuple):
@@ -38,6 +67,7 @@ class Study(NamedTuple):
         workers: processes at once; None = one for each core.
         checkpoint_every: timesteps between the checkpoints of a run; 0 = none.
         logged: whether interventions are logged.
+        launcher: who starts jobs; None = the sweep has processes of its own.
     """
 
     blocks: tuple[Block, ...]
@@ -45,6 +75,7 @@ class Study(NamedTuple):
     workers: int | None
     checkpoint_every: int
     logged: bool
+    launcher: Launcher | None = None
 
 
 def make_study(subjects: Sequence[str], given: Mapping[str, Any]) -> Study:
@@ -76,7 +107,47 @@ def make_study(subjects: Sequence[str], given: Mapping[str, Any]) -> Study:
         workers,
         options.get("checkpoint_every", 1000),
         options.get("log_interventions", False),
+        _launcher(options),
     )
+
+
+def _launcher(options: Mapping[str, Any]) -> Launcher | None:
+    """Return who starts the processes.
+
+    Raises:
+        ValueError: if the options contradict each other.
+    """
+    kind = options.get("launcher")
+    if kind is None:
+        for name in _OF_LAUNCHER:
+            expect(name not in options, f"{name} is an option of a launcher; add launcher = 'slurm', or omit it")
+        return None
+    expect(kind in LAUNCHERS, unknown("launcher", kind, LAUNCHERS))
+    expect("workers" not in options, "workers are processes of this machine; with a launcher, give jobs instead")
+    for name in ("slurm_partition", "slurm_time"):
+        expect(kind == "slurm" or name not in options, f"{name} is an option of launcher = 'slurm'; omit it")
+    found = Launcher(
+        kind,
+        jobs=options.get("jobs", 1),
+        lease=options.get("lease", _LEASE),
+        partition=options.get("slurm_partition", ""),
+        minutes=options.get("slurm_time", _MINUTES),
+    )
+    expect(found.jobs >= 1, f"jobs = {found.jobs} must be at least 1")
+    expect(found.lease >= 1, f"lease = {found.lease} must be at least 1 second")
+    expect(found.minutes >= _SHORTEST, f"slurm_time = {found.minutes} must be at least {_SHORTEST} minutes")
+    return found
+
+
+def to_plain(study: Study) -> dict[str, Any]:
+    """Return what another process needs to know of a sweep, as plain data."""
+    blocks, output = [dict(block) for block in study.blocks], str(study.output.absolute())
+    return study._asdict() | {"blocks": blocks, "output": output, "launcher": None}
+
+
+def from_plain(fields: Mapping[str, Any]) -> Study:
+    """Return the sweep that `to_plain` described."""
+    return Study(**{**fields, "output": Path(fields["output"]), "blocks": tuple(fields["blocks"])})
 
 
 def _read(path: Path) -> tuple[dict[str, Any], Block, list[Block]]:

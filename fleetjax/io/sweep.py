@@ -2,7 +2,7 @@
 
 The runs' folders are all that is kept, besides `sweep.json`, which says what the sweep is. So a sweep that was stopped or
 killed resumes by what they hold: finished runs are skipped, others resume from their checkpoints. Each process locks the folder
-of its run.
+of its run. Jobs of a cluster, which are nobody's children, agree by leases who has which run.
 """
 
 import contextlib
@@ -11,12 +11,13 @@ import os
 import time
 from collections.abc import Sequence
 
-from fleetjax.io import crew, files, folder, metrics_csv, resumable, text
+from fleetjax.io import cluster, crew, files, folder, metrics_csv, resumable, text
 from fleetjax.io.errors import Incomplete
+from fleetjax.io.job import LOGS
 from fleetjax.io.progress import progress_of_many, say
 from fleetjax.io.study import Study, plan
 
-FILE, LOGS = "sweep.json", "logs"
+FILE = "sweep.json"
 
 
 def check_folder(study: Study, runs: Sequence[folder.Run]) -> None:
@@ -66,25 +67,33 @@ def run_all(study: Study, runs: Sequence[folder.Run]) -> None:
     with files.lock(study.output):
         files.write_json(study.output / FILE, {"runs": study.blocks, "log_interventions": study.logged})
         (study.output / LOGS).mkdir(exist_ok=True)
-        waiting = [run for run in runs if not _is_finished(run)]
+        waiting = [run for run in runs if not is_finished(run)]
         finished, all_runs = len(runs) - len(waiting), text.plural(len(runs), "run")
         say(f"{all_runs}, {finished} of them finished already")
         try:
             failed = _complete(study, runs, waiting)
         except KeyboardInterrupt:
-            finished = sum(map(_is_finished, runs))
+            finished = sum(map(is_finished, runs))
             raise KeyboardInterrupt(f"with {finished} of {all_runs} finished; repeat the command to resume") from None
     if failed:
         raise Incomplete(f"{failed} of {all_runs} failed; repeat the command to try again; delete a damaged run folder first")
     print(f"{all_runs} finished, {text.duration(time.monotonic() - begun)} in all. Folder: {study.output}")
 
 
-def _is_finished(run: folder.Run) -> bool:
+def is_finished(run: folder.Run) -> bool:
+    """Return whether the folder of a run holds all of it."""
     try:
         found = folder.read_run(run.folder)
         return not folder.first_difference(run, found) and folder.read_finished(found) is not None
     except (OSError, ValueError):  # which a worker will meet again, and tell
         return False
+
+
+def _workers(study: Study, waiting: Sequence[folder.Run]) -> crew.Crew | cluster.Jobs:
+    """Return who completes the runs that wait."""
+    if study.launcher and waiting:
+        return cluster.Jobs(study, waiting)
+    return crew.Crew(waiting, study.workers, study.checkpoint_every, study.output / LOGS)
 
 
 def _complete(study: Study, runs: Sequence[folder.Run], waiting: Sequence[folder.Run]) -> int:
@@ -102,7 +111,7 @@ def _complete(study: Study, runs: Sequence[folder.Run], waiting: Sequence[folder
     with (
         progress_of_many(len(runs), sum(run.config.num_steps for run in runs), sum(timesteps.values())) as show,
         resumable.stoppable() as asked_to_stop,
-        contextlib.closing(crew.Crew(waiting, study.workers, study.checkpoint_every, logs)) as workers,
+        contextlib.closing(_workers(study, waiting)) as workers,
     ):
         while workers.busy:
             for run, reason in workers.wait():

@@ -32,7 +32,7 @@ def work(parent: Connection, cores: list[int], checkpoint_every: int, logs: Path
             run = parent.recv()
         except EOFError:
             return
-        _log_to(logs / f"{run.folder.name}.log")
+        log_to(logs / f"{run.folder.name}.log")
         from fleetjax.io import resumable
 
         try:
@@ -53,7 +53,7 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _log_to(path: Path) -> None:
+def log_to(path: Path) -> None:
     """Let what is printed from here on go to the end of a file, also what libraries print past Python."""
     with path.open("a") as log:
         for stream in (sys.stdout, sys.stderr):

@@ -1,0 +1,93 @@
+"""Leases: one owner at a time, what dead owners had is taken over, and an owner that was taken for dead ends."""
+
+import multiprocessing
+import os
+import threading
+import time
+
+import pytest
+
+from fleetjax.io.lease import LOST, Leases
+
+RUN = "navigation-cur-seed0"
+LONG, SHORT = 1000.0, 0.5  # seconds
+
+
+def test_a_run_has_one_owner_and_is_free_when_it_is_done_with_it(tmp_path):
+    mine, other = Leases(tmp_path, "sweep", LONG), Leases(tmp_path, "sweep", LONG)
+    assert mine.is_free(RUN)
+    assert other.is_free(RUN)
+    with mine.taken(RUN) as held:
+        assert held
+        assert not other.is_free(RUN)
+        assert other.ended(RUN) is None
+        held.end("failed", "disk full")
+    assert other.ended(RUN).reason == "disk full"
+    later = Leases(tmp_path, "another sweep", LONG)
+    assert later.ended(RUN) is None
+    assert later.is_free(RUN)
+
+
+def test_of_many_that_try_one_gets_a_run(tmp_path):
+    barrier, won, over = threading.Barrier(8), [], threading.Event()
+
+    def claim():
+        leases = Leases(tmp_path, "sweep", LONG)
+        assert leases.is_free(RUN)
+        barrier.wait()
+        with leases.taken(RUN) as held:
+            won.append(bool(held))
+            over.wait()
+
+    threads = [threading.Thread(target=claim) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    while len(won) < 8:
+        time.sleep(1e-3)
+    over.set()
+    for thread in threads:
+        thread.join()
+    assert sorted(won) == [False] * 7 + [True]
+    assert [path.name for path in (tmp_path / RUN).iterdir()] == ["0"]
+
+
+def test_an_owner_that_renews_keeps_its_run_for_longer_than_a_term(tmp_path):
+    mine, other = Leases(tmp_path, "sweep", SHORT), Leases(tmp_path, "sweep", SHORT)
+    assert mine.is_free(RUN)
+    with mine.taken(RUN):
+        until = time.monotonic() + 4 * SHORT
+        while time.monotonic() < until:
+            assert not other.is_free(RUN)
+            time.sleep(SHORT / 20)
+    assert other.is_free(RUN)
+
+
+def own(folder, term, begun, proceed):
+    leases = Leases(folder, "sweep", term)
+    assert leases.is_free(RUN)
+    with leases.taken(RUN):
+        begun.set()
+        proceed.wait()
+
+
+@pytest.mark.parametrize("alive", [False, True])
+def test_a_dead_owner_loses_its_run_and_one_taken_for_dead_ends(tmp_path, alive):
+    context = multiprocessing.get_context("spawn")
+    begun, proceed = context.Event(), context.Event()
+    process = context.Process(target=own, args=(tmp_path, LONG, begun, proceed))  # it renews once in minutes
+    process.start()
+    begun.wait()
+    if not alive:
+        process.kill()
+        process.join()
+    leases = Leases(tmp_path, "sweep", SHORT)
+    assert not leases.is_free(RUN)
+    while not leases.is_free(RUN):
+        time.sleep(SHORT / 20)
+    with leases.taken(RUN) as held:
+        assert held
+        if alive:
+            proceed.set()
+            process.join()
+            assert process.exitcode == LOST
+    assert sorted(os.listdir(tmp_path / RUN)) == ["0", "1"]

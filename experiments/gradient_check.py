@@ -167,8 +167,9 @@ def draw(curves: dict[str, Iterable[tuple[float, float]]]) -> Figure:
         for axes, (name, curve) in zip(shown.subplots(1, len(curves), squeeze=False)[0], curves.items(), strict=True):
             x, y = zip(*curve, strict=True)
             axes.plot(x, y, marker="o", color="#0072B2")
-            axes.set(title=name, xscale="log")
-            if "norm" in name:
+            what, by = name.split(", by ")
+            axes.set(title=what, xlabel=by, xscale="log")
+            if "norm" in what:
                 axes.set_yscale("log")
             else:
                 axes.set_ylim(-1.05, 1.05)

@@ -2,10 +2,11 @@
 
     python experiments/claims.py [--results experiments/results] [--output FILE.md]
 
-A claim says that some means over seeds are higher than others. The differences are taken seed by seed, and their 95 % intervals
-(BCa bootstrap) decide: the claim *holds* if all lie above 0, *does not hold* if one lies below, and is *undecided* otherwise.
-With fewer than five seeds, the range of the differences stands for the interval, in parentheses: such a verdict is weak. One
-claim (8.8 times) needs one pair only. The table shows the difference that decides, or the closest one.
+A claim says that some means over seeds are higher than others. Of each pair, the differences are taken seed by seed, and the
+95 % intervals of their means (BCa bootstrap) decide: the claim *holds* if all intervals lie above 0, *does not hold* if one
+whole interval lies below, and is *undecided* otherwise; it is *incomplete* while pairs are missing that could decide. With
+fewer than five seeds, the range of the differences stands for the interval, in parentheses: such a verdict is weak. One claim
+(8.8 times) needs one pair only. The table shows the difference that decides, or the closest one.
 """
 
 import argparse
@@ -34,7 +35,7 @@ NAMES = {
     "min_teleop_time": "t_T",
     "hard_reset_time": "t_R",
     "rise_of_return": "ROHE at the end - in the middle",
-    "fall_of_idle": "idle robots in the initial period - 10 x later",
+    "fall_of_idle": "idle robots: initial period - 10 x later",
     "missing_to_one": "1 - successes",
 }
 
@@ -266,11 +267,11 @@ def judge(study: Study, claim: Claim) -> tuple[str, Difference | None]:
     if claim.of_any:
         best = max(found, key=lambda d: d.low)
         refuted = complete and all(d.high < 0 for d in found)
-        return "holds" if best.low > 0 else "does not hold" if refuted else "undecided" if complete else "not run yet", best
+        return "holds" if best.low > 0 else "does not hold" if refuted else "undecided" if complete else "incomplete", best
     if any(d.high < 0 for d in found):
         return "does not hold", min(found, key=lambda d: d.high)
     worst = min(found, key=lambda d: d.low)
-    return "not run yet" if not complete else "holds" if worst.low > 0 else "undecided", worst
+    return "incomplete" if not complete else "holds" if worst.low > 0 else "undecided", worst
 
 
 def cells(claim: Claim, verdict: str, difference: Difference | None) -> tuple[str, ...]:

@@ -47,7 +47,7 @@ def mean(one: Group, metric: str, *, spread: bool = False) -> str:
 def achieved(found: list[Group], alone: Mapping[str, Group]) -> str:
     """Return a table of what groups of runs achieved, and of what their policies did `alone`, by name."""
     head = ["", "seeds", *COLUMNS.values(), "ROHE, demonstrations counted"]
-    policies = ["policy alone: successes", "violations", "successes in the paper"] if alone else []
+    policies = ["policy alone: successes", "violations", "the paper's policy: successes"] if alone else []
     table = [tuple(head + policies)]
     for one in sorted(found, key=lambda one: [*claims.NAMES].index(one.config.environment)):
         place, algorithm = one.config.environment, one.config.algorithm

@@ -15,17 +15,18 @@ from fleetjax.io.folder import Run
 from fleetjax.io.job import LEASES, Job
 from fleetjax.io.lease import Leases
 
-FOLDER = "jobs"  # of what submitit writes
+FOLDER = "jobs"  # where submitit writes
 _POLL = 0.5  # seconds
 _DONE = 60.0  # seconds that stopped jobs get
+_REQUEUES = 10_000  # of a job at most
 _WARNING = 300  # seconds before the end of its time in which a job of a cluster is requeued
 
 
 def check(launcher: study.Launcher | None) -> None:
-    """Check that the launcher is there.
+    """Check that the launcher can be used here.
 
     Raises:
-        ValueError: if it is not.
+        ValueError: if it cannot.
     """
     if launcher is None:
         return
@@ -60,7 +61,7 @@ class Jobs:
         self._kind, self._left, self._stopping = launcher.kind, list(waiting), False
         self._leases = Leases(asked.output / LEASES, name, launcher.lease)
         self._log = asked.output / FOLDER
-        executor = submitit.AutoExecutor(folder=self._log, cluster=launcher.kind)
+        executor = submitit.AutoExecutor(folder=self._log, cluster=launcher.kind, slurm_max_num_timeout=_REQUEUES)
         common: dict[str, Any] = {"name": "fleetjax", "timeout_min": launcher.minutes, "cpus_per_task": 1}
         if launcher.kind == "slurm":
             common |= {"slurm_signal_delay_s": _WARNING, "slurm_use_srun": True}
@@ -77,7 +78,7 @@ class Jobs:
         return list(self._left)
 
     def wait(self) -> list[tuple[Run, str]]:
-        """Wait a little; return the runs that ended meanwhile, each with "" or why it failed; not those that were stopped."""
+        """Wait briefly. Return the runs that finished, each with "", and those that failed, each with the reason."""
         time.sleep(_POLL)
         over = all(job.done() for job in self._jobs)  # before the leases are read, which jobs write first
         ended = [(run, found.reason) for run in self._left if (found := self._leases.ended(run.folder.name))]

@@ -86,7 +86,7 @@ class Crew:
         return [one.run for one in self._workers if one.run]
 
     def wait(self) -> list[tuple[Run, str]]:
-        """Wait a little; return the runs that ended meanwhile, each with "" or why it failed; not those that were stopped."""
+        """Wait briefly. Return the runs that finished, each with "", and those that failed, each with the reason."""
         working: dict[Any, _Worker] = {one.pipe: one for one in self._workers if one.run}
         ended = []
         for pipe in wait(list(working), _POLL):

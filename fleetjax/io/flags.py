@@ -232,13 +232,13 @@ def _add_sweep(commands: Any, environment: str | None) -> None:
     sweep.add_argument("--output", metavar="DIR", type=Path, help="folder for the run folders", **options)
     workers = "processes, which share the cores [default: one for each core]"
     sweep.add_argument("--workers", metavar="W", type=_integer, help=workers, **options)
-    launcher = "who starts jobs, each with a core: this machine, or a cluster's scheduler [default: --workers processes]"
+    launcher = "complete the sweep by one-core jobs: local = on this machine, slurm = on a cluster; replaces --workers"
     sweep.add_argument("--launcher", choices=LAUNCHERS, help=launcher, **options)
-    sweep.add_argument("--jobs", metavar="J", type=_integer, help="jobs of the launcher [default: 1]", **options)
-    sweep.add_argument("--slurm-partition", metavar="P", help="partition of the cluster [default: its own]", **options)
-    term = "seconds without a sign of life after which another job takes over a job's run [default: 120]"
+    sweep.add_argument("--jobs", metavar="J", type=_integer, help="number of jobs [default: 1]", **options)
+    sweep.add_argument("--slurm-partition", metavar="P", help="SLURM partition [default: the cluster's]", **options)
+    term = "take over the run of a job that has shown no sign of life for S seconds [default: 180]"
     sweep.add_argument("--lease", metavar="S", type=_integer, help=term, **options)
-    minutes = "minutes after which the scheduler stops and requeues a job [default: 1440]"
+    minutes = "minutes of a job; it is requeued shortly before they are over [default: 1440]"
     sweep.add_argument("--slurm-time", metavar="MIN", type=_integer, help=minutes, **options)
     every = "timesteps between the checkpoints of a run; 0 = none [default: 1000]"
     sweep.add_argument("--checkpoint-every", metavar="N", type=_integer, help=every, **options)

@@ -23,7 +23,7 @@ class Job(NamedTuple):
     Attributes:
         study: fields of `study.Study`, as plain data.
         sweep: name of the sweep that was started.
-        core: which of its machine's cores to use; None = those that the scheduler gave it.
+        core: index of the core to use, among those that it may use; None = all that the scheduler gave it.
         term: seconds, see `Leases`.
     """
 
@@ -33,7 +33,7 @@ class Job(NamedTuple):
     term: float
 
     def __call__(self) -> None:
-        """Complete runs until none is left that is neither finished nor failed."""
+        """Complete runs until all have finished or failed."""
         cores = sorted(os.sched_getaffinity(0))
         if self.core is not None:
             os.sched_setaffinity(0, {cores[self.core % len(cores)]})
@@ -43,14 +43,14 @@ class Job(NamedTuple):
             print(f"interrupted {' '.join(interrupt.args)}", file=sys.stderr)
 
     def checkpoint(self, *args: Any, **kwargs: Any) -> Any:
-        """Return what is submitted anew when time is up: the same."""
+        """Return the job to submit when its time is up: this one."""
         from submitit.helpers import DelayedSubmission
 
         return DelayedSubmission(self, *args, **kwargs)
 
 
 def complete_all(job: Job) -> None:
-    """Take and complete runs. While others have all that are left, wait: one of them may die.
+    """Take and complete runs. If other jobs hold all runs that are left, wait: one of those jobs may die.
 
     Raises:
         KeyboardInterrupt: if the job was asked to stop.

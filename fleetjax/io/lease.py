@@ -1,12 +1,12 @@
 """Which worker has a run, where no process is the parent of all: leases in a folder that all workers share.
 
-A run has a folder of leases: files 0, 1, 2 ..., of which the highest counts. To take a run is to make the next file, by a hard
-link, which succeeds for one worker alone. Its owner renews it: it writes a higher number to it several times in each `term`. A
-worker that has seen the same number for a whole term takes the owner for dead, and makes the next file. An owner that finds a
-higher file, or could not write for most of a term, has lost the run: it ends its process at once.
+A run has a folder of leases: files 0, 1, 2 ..., of which the highest counts. A worker takes the run by making the next file,
+with a hard link, which succeeds for one worker alone. The owner renews its lease: several times in each `term` it raises a
+counter in the file. A worker that sees the same counter for a whole term takes the owner for dead, and makes the next file. An
+owner that finds a higher file, or could not write for most of a term, has lost the run: it ends its process at once.
 
-Assumed of the file system: hard links are atomic, and what one machine wrote, another that opens the file sees within half a
-term. Network file systems do both with their usual settings, while their locks may not work at all. Clocks need not agree.
+Assumed of the file system: of several machines that make the same hard link one succeeds, and a machine that opens a file sees
+what another wrote at least half a term ago. Locks may fail to keep other machines out. Clocks need not agree.
 """
 
 import contextlib
@@ -23,7 +23,7 @@ from typing import NamedTuple
 from fleetjax.io import files
 
 RENEWALS = 6  # in a term
-LOST = 75  # exit code of a process that has lost its run; of os.EX_TEMPFAIL
+LOST = 75  # exit code of a process that has lost its run: EX_TEMPFAIL
 
 
 class Lease(NamedTuple):
@@ -43,7 +43,7 @@ class Lease(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """The newest lease of a run, and when it was first seen as it is, by this process's clock."""
+    """The newest lease of a run, and since when it has been unchanged, by this process's clock."""
 
     number: int
     lease: Lease | None
@@ -73,7 +73,7 @@ class Leases:
         return lease
 
     def ended(self, run: str) -> Lease | None:
-        """Return the lease of a run that finished or failed in this sweep; None if it did not."""
+        """Return the newest lease of a run if the run finished or failed in this sweep, else None."""
         lease = self.look(run)
         return lease if lease and lease.end in ("finished", "failed") and lease.owner[2] == self._me[2] else None
 

@@ -25,7 +25,7 @@ from fleetjax.registry import unknown
 
 Block = Mapping[str, list[Any]]
 _MOST_SEEDS = 100_000
-_LEASE = 120  # seconds; NFS shows others' files with up to 60 s delay
+_LEASE = 180  # seconds; NFS shows others' files with up to 60 s delay
 _MINUTES = 24 * 60  # of a job
 _SHORTEST = 15  # minutes; of which the scheduler's warning takes the last ones
 _OF_LAUNCHER: Mapping[str, type] = {"jobs": int, "lease": int, "slurm_partition": str, "slurm_time": int}

@@ -160,16 +160,15 @@ def by_length(config: Config, keys: jax.Array, lengths: Sequence[int]) -> tuple[
     return rows, curve
 
 
-def draw(curves: dict[str, Iterable[tuple[float, float]]]) -> Figure:
-    """Return a figure of the cosine by temperature and the norm by length."""
+def draw(curves: dict[tuple[str, str], Iterable[tuple[float, float]]]) -> Figure:
+    """Return a figure with a panel for each curve, whose key is its title and the name of its x axis."""
     with figure.style():
         shown = Figure(figsize=(8, 3), layout="constrained")
-        for axes, (name, curve) in zip(shown.subplots(1, len(curves), squeeze=False)[0], curves.items(), strict=True):
+        for axes, ((title, by), curve) in zip(shown.subplots(1, len(curves), squeeze=False)[0], curves.items(), strict=True):
             x, y = zip(*curve, strict=True)
             axes.plot(x, y, marker="o", color="#0072B2")
-            what, by = name.split(", by ")
-            axes.set(title=what, xlabel=by, xscale="log")
-            if "norm" in what:
+            axes.set(title=title, xlabel=by, xscale="log")
+            if "norm" in title:
                 axes.set_yscale("log")
             else:
                 axes.set_ylim(-1.05, 1.05)
@@ -206,14 +205,14 @@ def main() -> None:
     wanted_at = TEMPERATURES if "temperature" in wanted else STEPPED if "steps" in wanted else ()
     slopes = {t: relaxed_at(config, keys, t) for t in wanted_at}
     if "temperature" in wanted:
-        table, curves["cosine with the smoothed gradient, by temperature"] = by_temperature(slopes, reference)
+        table, curves["cosine with the smoothed gradient", "temperature"] = by_temperature(slopes, reference)
         show("Relaxed and smoothed gradients", table)
     if "steps" in wanted:
         directions = {"the smoothed gradient": reference, "the opposite direction": -reference}
         directions |= {f"the relaxed one, temperature {t:g}": slopes[t].mean(axis=0) for t in STEPPED}
         show("Steps", check_steps(config, directions, range(1000, 1000 + args.fresh)))
     if "length" in wanted:
-        table, curves["norm of the relaxed gradient, by timesteps"] = by_length(config, keys, args.lengths)
+        table, curves["norm of the relaxed gradient", "timesteps"] = by_length(config, keys, args.lengths)
         show("Length", table)
     if args.output and curves:
         files.write(args.output, figure.render(draw(curves)))

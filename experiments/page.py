@@ -39,9 +39,9 @@ COLUMNS = {"successes": "successes", "violations": "violations", "human_steps": 
 
 def mean(one: Group, metric: str, *, spread: bool = False) -> str:
     """Return the mean of a metric over seeds, with the smallest and the largest if asked for."""
-    values = np.array([comparing.value(run, metric) for run in one.runs.values()])
-    shown = claims.number(values.mean())
-    return f"{shown} ({claims.number(values.min())} to {claims.number(values.max())})" if spread and len(values) > 1 else shown
+    found = np.array(list(comparing.values_by_seed(one, metric).values()))
+    shown = claims.number(found.mean())
+    return f"{shown} ({claims.number(found.min())} to {claims.number(found.max())})" if spread and len(found) > 1 else shown
 
 
 def achieved(found: list[Group], alone: Mapping[str, Group]) -> str:

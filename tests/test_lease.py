@@ -15,17 +15,17 @@ LONG, SHORT = 1000.0, 0.5  # seconds
 
 def test_a_run_has_one_owner_and_is_free_when_it_is_done_with_it(tmp_path):
     mine, other = Leases(tmp_path, "sweep", LONG), Leases(tmp_path, "sweep", LONG)
-    assert mine.is_free(RUN)
-    assert other.is_free(RUN)
+    assert mine.is_free(mine.look(RUN))
+    assert other.is_free(other.look(RUN))
     with mine.taken(RUN) as held:
         assert held
-        assert not other.is_free(RUN)
-        assert other.ended(RUN) is None
+        assert not other.is_free(other.look(RUN))
+        assert other.ended(other.look(RUN)) is None
         held.end("failed", "disk full")
-    assert other.ended(RUN).reason == "disk full"
+    assert other.ended(other.look(RUN)).reason == "disk full"
     later = Leases(tmp_path, "another sweep", LONG)
-    assert later.ended(RUN) is None
-    assert later.is_free(RUN)
+    assert later.ended(later.look(RUN)) is None
+    assert later.is_free(later.look(RUN))
 
 
 def test_of_many_that_try_one_gets_a_run(tmp_path):
@@ -33,7 +33,7 @@ def test_of_many_that_try_one_gets_a_run(tmp_path):
 
     def claim():
         leases = Leases(tmp_path, "sweep", LONG)
-        assert leases.is_free(RUN)
+        assert leases.is_free(leases.look(RUN))
         barrier.wait()
         with leases.taken(RUN) as held:
             won.append(bool(held))
@@ -53,18 +53,18 @@ def test_of_many_that_try_one_gets_a_run(tmp_path):
 
 def test_an_owner_that_renews_keeps_its_run_for_longer_than_a_term(tmp_path):
     mine, other = Leases(tmp_path, "sweep", SHORT), Leases(tmp_path, "sweep", SHORT)
-    assert mine.is_free(RUN)
+    assert mine.is_free(mine.look(RUN))
     with mine.taken(RUN):
         until = time.monotonic() + 4 * SHORT
         while time.monotonic() < until:
-            assert not other.is_free(RUN)
+            assert not other.is_free(other.look(RUN))
             time.sleep(SHORT / 20)
-    assert other.is_free(RUN)
+    assert other.is_free(other.look(RUN))
 
 
 def own(folder, term, begun, proceed):
     leases = Leases(folder, "sweep", term)
-    assert leases.is_free(RUN)
+    assert leases.is_free(leases.look(RUN))
     with leases.taken(RUN):
         begun.set()
         proceed.wait()
@@ -81,8 +81,8 @@ def test_a_dead_owner_loses_its_run_and_one_taken_for_dead_ends(tmp_path, alive)
         process.kill()
         process.join()
     leases = Leases(tmp_path, "sweep", SHORT)
-    assert not leases.is_free(RUN)
-    while not leases.is_free(RUN):
+    assert not leases.is_free(leases.look(RUN))
+    while not leases.is_free(leases.look(RUN)):
         time.sleep(SHORT / 20)
     with leases.taken(RUN) as held:
         assert held

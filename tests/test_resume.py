@@ -605,3 +605,18 @@ def test_a_full_disk_during_the_run_is_told_and_the_run_goes_on_later(stopped, w
     assert "Traceback" not in said
     assert run_here("run", "--resume", stopped) == 0
     assert_same(stopped, whole)
+
+
+def test_a_block_within_another_hears_what_was_asked_before_it():
+    with resumable.stoppable() as outer:
+        signal.raise_signal(signal.SIGTERM)
+        assert outer()
+        with resumable.stoppable() as inner:
+            assert inner()
+            with pytest.raises(KeyboardInterrupt, match="at once"):
+                signal.raise_signal(signal.SIGTERM)
+    with resumable.stoppable() as later:
+        assert not later()
+        with resumable.stoppable() as inner:
+            signal.raise_signal(signal.SIGTERM)
+        assert later()

@@ -64,7 +64,7 @@ class Jobs:
         executor = submitit.AutoExecutor(folder=self._log, cluster=launcher.kind, slurm_max_num_timeout=_REQUEUES)
         common: dict[str, Any] = {"name": "fleetjax", "timeout_min": launcher.minutes, "cpus_per_task": 1}
         if launcher.kind == "slurm":
-            common |= {"slurm_signal_delay_s": _WARNING, "slurm_use_srun": True}
+            common |= {"slurm_signal_delay_s": _WARNING}
             common |= {"slurm_partition": launcher.partition} if launcher.partition else {}
         executor.update_parameters(**common)
         plain, local = study.to_plain(asked), launcher.kind == "local"
@@ -81,7 +81,7 @@ class Jobs:
         """Wait briefly. Return the runs that finished, each with "", and those that failed, each with the reason."""
         time.sleep(_POLL)
         over = all(job.done() for job in self._jobs)  # before the leases are read, which jobs write first
-        ended = [(run, found.reason) for run in self._left if (found := self._leases.ended(run.folder.name))]
+        ended = [(run, found.reason) for run in self._left if (found := self._leases.ended(self._leases.look(run.folder.name)))]
         done = {run.folder for run, _ in ended}
         self._left = [run for run in self._left if run.folder not in done]
         if over:

@@ -68,7 +68,7 @@ def compare(
 
 def _row(one: Group, metric: str, other: Group | None) -> dict[str, Any]:
     """Return a row of a comparison: statistics of a group, and how it differs from another."""
-    by_seed = _values(one, metric)
+    by_seed = values_by_seed(one, metric)
     values = np.array(list(by_seed.values()))
     low, high = statistics.mean_bounds(values)
     row = {
@@ -81,11 +81,11 @@ def _row(one: Group, metric: str, other: Group | None) -> dict[str, Any]:
         "high": high,
         "bounds": _kind(len(values)),
         "interquartile_mean": statistics.interquartile_mean(values),
-        "human_time": np.mean(list(_values(one, "human_steps").values())),
+        "human_time": np.mean(list(values_by_seed(one, "human_steps").values())),
     }
     if other is None or other is one:
         return row | _NOTHING
-    return row | {"against": other.label} | _difference(by_seed, _values(other, metric))
+    return row | {"against": other.label} | _difference(by_seed, values_by_seed(other, metric))
 
 
 def _difference(values: Mapping[int, float], others: Mapping[int, float]) -> dict[str, Any]:
@@ -114,12 +114,12 @@ def _kind(seeds: int) -> str:
     return "range" if seeds < statistics.MIN_SEEDS else "interval"
 
 
-def _values(one: Group, metric: str) -> dict[int, float]:
+def values_by_seed(one: Group, metric: str) -> dict[int, float]:
     """Return what the runs of a group achieved, by seed."""
-    return {seed: value(run, metric) for seed, run in one.runs.items()}
+    return {seed: _value(run, metric) for seed, run in one.runs.items()}
 
 
-def value(run: Outcome, metric: str) -> float:
+def _value(run: Outcome, metric: str) -> float:
     """Return what a run achieved.
 
     Raises:

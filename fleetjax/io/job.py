@@ -64,8 +64,9 @@ def complete_all(job: Job) -> None:
         while left:
             if asked_to_stop():
                 raise KeyboardInterrupt("between runs")
-            left = {name: run for name, run in left.items() if not leases.ended(name)}
-            free = [run for name, run in left.items() if leases.is_free(name)]
+            seen = {name: leases.look(name) for name in left}
+            left = {name: run for name, run in left.items() if not leases.ended(seen[name])}
+            free = [run for name, run in left.items() if leases.is_free(seen[name])]
             if not free:
                 time.sleep(job.term / POLLS)
                 continue

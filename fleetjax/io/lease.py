@@ -43,7 +43,13 @@ class Lease(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """The newest lease of a run, and since when it has been unchanged, by this process's clock."""
+    """The newest lease of a run.
+
+    Attributes:
+        number: of its file; -1 = nobody ever had the run.
+        lease: what it says; None if there is none, or it cannot be read at this moment.
+        since: since when it has been unchanged, by this process's clock.
+    """
 
     number: int
     lease: Lease | None
@@ -63,29 +69,27 @@ class Leases:
         self._folder, self._term, self._seen = folder, term, dict[str, Seen]()
         self._me = (socket.gethostname(), os.getpid(), sweep)
 
-    def look(self, run: str) -> Lease | None:
-        """Return the newest lease of a run; None if nobody ever had it."""
+    def look(self, run: str) -> Seen:
+        """Return the newest lease of a run, as the folder has it now."""
         number = max((int(path.name) for path in (self._folder / run).glob("[0-9]*")), default=-1)
         lease = _read(self._folder / run / str(number)) if number >= 0 else None
         before = self._seen.get(run)
         if before is None or (before.number, before.lease) != (number, lease):
             self._seen[run] = Seen(number, lease, time.monotonic())
-        return lease
+        return self._seen[run]
 
-    def ended(self, run: str) -> Lease | None:
-        """Return the newest lease of a run if the run finished or failed in this sweep, else None."""
-        lease = self.look(run)
+    def ended(self, seen: Seen) -> Lease | None:
+        """Return the lease if its run finished or failed in this sweep, else None."""
+        lease = seen.lease
         return lease if lease and lease.end in ("finished", "failed") and lease.owner[2] == self._me[2] else None
 
-    def is_free(self, run: str) -> bool:
+    def is_free(self, seen: Seen) -> bool:
         """Return whether a run that has not ended may be taken: its owner is done with it, or has not renewed it for a term."""
-        lease = self.look(run)
-        seen = self._seen[run]
-        return seen.number < 0 or bool(lease and lease.end) or time.monotonic() - seen.since >= self._term
+        return seen.number < 0 or bool(seen.lease and seen.lease.end) or time.monotonic() - seen.since >= self._term
 
     @contextlib.contextmanager
     def taken(self, run: str) -> Iterator["Held | None"]:
-        """Take a run that is free, and keep it until the block ends; None if another worker was faster."""
+        """Take a run that was free when last looked at, and keep it until the block ends; None if another worker was faster."""
         path = self._folder / run / str(self._seen[run].number + 1)
         held = Held(path, Lease(self._me, 0), self._term)
         if not held.take():

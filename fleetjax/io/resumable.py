@@ -224,25 +224,34 @@ def seal(run: folder.Run, metrics: Metrics) -> None:
     folder.write_config(run, sealed=True)
 
 
-@contextlib.contextmanager
-def stoppable() -> Iterator[Callable[[], bool]]:
-    """Yield a function that tells whether the process was asked to stop, by Ctrl-C or SIGTERM; twice stops it at once."""
-    asked = False
+class _Stop:
+    """What signals call in `stoppable`: the first one asks, the second one stops at once."""
 
-    def ask(number: int, frame: Any) -> None:
-        nonlocal asked
-        if asked:
+    def __init__(self):
+        self.asked = False
+
+    def __call__(self, number: int, frame: Any) -> None:
+        if self.asked:
             raise KeyboardInterrupt("at once, without a checkpoint")
-        asked = True
+        self.asked = True
         say("\nstopping after this chunk of timesteps; press Ctrl-C again to stop at once")
 
+
+@contextlib.contextmanager
+def stoppable() -> Iterator[Callable[[], bool]]:
+    """Yield a function that tells whether the process was asked to stop, by Ctrl-C or SIGTERM; twice stops it at once.
+
+    A block within another one hears also what the outer one was asked before.
+    """
     if threading.current_thread() is not threading.main_thread():  # which alone hears signals
         yield lambda: False
         return
     heard = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) is not signal.SIG_IGN]
-    before = {number: signal.signal(number, ask) for number in heard}
+    outer = [handler for number in heard if isinstance(handler := signal.getsignal(number), _Stop)]
+    stop = outer[0] if outer else _Stop()
+    before = {number: signal.signal(number, stop) for number in heard}
     try:
-        yield lambda: asked
+        yield lambda: stop.asked
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -255,7 +255,9 @@ def name_of(setting: Setting, other: Setting | None) -> str:
     """Return what tells a setting from another."""
     told = [f"{NAMES.get(name, name)} = {x}" for name, x in setting.items() if other and other.get(name) != x and name in NAMES]
     same = other and setting["algorithm"] == other["algorithm"]
-    return ", ".join(told) if same and told else text.label(setting["algorithm"])
+    name = text.label(setting["algorithm"])
+    own = name if name != text.label("cur") or setting.get("initial_period", 1) else f"{name} without initial period"
+    return ", ".join(told) if same and told else own
 
 
 def judge(study: Study, claim: Claim) -> tuple[str, Difference | None]:

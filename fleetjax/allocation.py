@@ -6,6 +6,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
+from fleetjax import sharding
 from fleetjax.types import HumanState, Signals
 
 # `(score f32[N], humans HumanState[M], min_time i32[N], key, available bool[M] | None, signals | None) -> HumanState[M]`.
@@ -57,15 +58,13 @@ def allocate(
     unlocked = available & ~bound
 
     competing = jnp.where(score > 0, score, 0.0)  # a NaN is not > 0
-    competing = competing.at[jnp.where(bound, humans.robot, num_robots)].set(0.0, mode="drop")
-    order = tie_order(key, num_robots)
-    best, rank = jax.lax.top_k(competing[order], min(num_humans, num_robots))
-    chosen = order[rank]
+    competing = sharding.put(competing, jnp.where(bound, humans.robot, num_robots), 0.0)
+    best, chosen = choose(competing, key, min(num_humans, num_robots))
     is_chosen = (best > 0) & (jnp.arange(chosen.size) < jnp.sum(unlocked))
 
-    chosen_robots = jnp.zeros(num_robots, bool).at[chosen].set(is_chosen)
+    chosen_robots = sharding.put(jnp.zeros(num_robots, bool), chosen, is_chosen)
     stays = unlocked & assigned & chosen_robots[humans.robot]
-    kept_robots = jnp.zeros(num_robots, bool).at[jnp.where(stays, humans.robot, num_robots)].set(True, mode="drop")
+    kept_robots = sharding.put(jnp.zeros(num_robots, bool), jnp.where(stays, humans.robot, num_robots), True)
 
     is_new = is_chosen & ~kept_robots[chosen]
     place = jnp.where(is_new, jnp.cumsum(is_new) - 1, num_humans)
@@ -83,6 +82,30 @@ def is_bound(humans: HumanState, min_time: jax.Array) -> jax.Array:
     return (humans.robot >= 0) & (humans.duration < min_time[humans.robot])
 
 
+def choose(score: jax.Array, key: jax.Array, number: int) -> tuple[jax.Array, jax.Array]:
+    """Return f32[K] the highest scores of f32[N] in falling order, and i32[K] whose they are; ties are in random order.
+
+    On a mesh each device chooses among its own robots; the choice among these is the choice among all.
+    """
+    n = score.shape[0]
+    if sharding.division() is None:
+        order = tie_order(key, n)
+        best, rank = jax.lax.top_k(score[order], number)
+        return best, order[rank]
+
+    def best_of(score: jax.Array, bits: jax.Array, robot: jax.Array) -> tuple[jax.Array, ...]:
+        order = jnp.argsort(bits)
+        best, rank = jax.lax.top_k(score[order], min(number, score.size))
+        return best, bits[order[rank]], robot[order[rank]]
+
+    def best_of_all(*own: jax.Array) -> tuple[jax.Array, jax.Array]:
+        best, _, robot = best_of(*sharding.gather(best_of(*own)))
+        return best, robot
+
+    everyone = (score, jax.random.bits(key, (n,)), jnp.arange(n))
+    return sharding.on_each(best_of_all, sharding.EVERYWHERE, *everyone)
+
+
 def tie_order(key: jax.Array, num_robots: int) -> jax.Array:
     """Return i32[N], the robots in random order."""
     return jnp.argsort(jax.random.bits(key, (num_robots,)))  # one draw, where `jax.random.permutation` splits the key first
@@ -92,4 +115,4 @@ def helper_of(humans: HumanState, num_robots: int) -> jax.Array:
     """Return i32[N], the human that helps each robot, -1 = none."""
     num_humans = humans.robot.shape[0]
     place = jnp.where(humans.robot >= 0, humans.robot, num_robots)
-    return jnp.full(num_robots, -1, jnp.int32).at[place].set(jnp.arange(num_humans, dtype=jnp.int32), mode="drop")
+    return sharding.put(jnp.full(num_robots, -1, jnp.int32), place, jnp.arange(num_humans, dtype=jnp.int32))

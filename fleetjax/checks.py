@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 
-from fleetjax import envs
+from fleetjax import envs, sharding
 from fleetjax.config import Config, taught_pairs, validate
 from fleetjax.envs import Env
 from fleetjax.fleet import FleetState, init, make_parts
 from fleetjax.learning import imitation
-from fleetjax.learning.buffer import Buffer
+from fleetjax.learning.buffer import Buffer, is_buffer
 from fleetjax.learning.networks import Normalizer
 from fleetjax.metrics import Metrics
 from fleetjax.precision import in_32_bits
@@ -51,12 +51,48 @@ def check_run(config: Config, env: Env | None = None, state: FleetState | None =
         ValueError: if the configuration is not valid, the run cannot fit the memory, or it cannot start from the state.
     """
     validate(config, env)
+    check_mesh(config)
     env = env or envs.make(config.environment, config.backend)
     shapes = state_shapes(config, env)
     check_memory(config, shapes)
     if state is not None:
         check_state(config, env, state, shapes)
     return env
+
+
+def check_mesh(config: Config) -> None:
+    """Check that the fleet can be divided over the mesh for which it is traced.
+
+    Raises:
+        ValueError: if the number of robots is not a multiple of the number of devices, or the allocation is soft.
+    """
+    here, n = sharding.division(), config.num_robots
+    if here is None:
+        return
+    size = here.mesh.size
+    if n % size:
+        sizes = [str(near) for near in (n // size * size, (n // size + 1) * size) if near >= config.num_humans]
+        raise ValueError(
+            f"num_robots = {n} cannot be divided equally among {size} devices; use num_robots = {' or '.join(sizes)}"
+        )
+    if config.allocation == "soft":
+        raise ValueError("allocation = 'soft' runs on one device only; leave out the mesh")
+
+
+def robot_bytes(config: Config, state: FleetState) -> int:
+    """Return about how many bytes of memory a robot takes while a run is computed, 3 S + 8 K (H + A).
+
+    S is the size of its state, which a run holds three times: at the start, at the end and in between. Beside it are two
+    layers of H units, and two actions of A numbers, of each of the K members of the policy; a number has 4 bytes. What the
+    physics needs inside a step, and how a network sees images, is not counted. Nothing is computed.
+
+    Args:
+        config: configuration.
+        state: shapes of the fleet's state.
+    """
+    action_size = state.human_data.pairs.rows.action.shape[-1]
+    in_state = count_bytes(state.env) // config.num_robots
+    return 3 * in_state + 8 * config.ensemble_size * (max(config.hidden_sizes) + action_size)
 
 
 def check_memory(config: Config, state: FleetState) -> None:
@@ -69,15 +105,18 @@ def check_memory(config: Config, state: FleetState) -> None:
     Raises:
         ValueError: if they do not; the message has the estimate, the memory there is, and the field to reduce.
     """
-    learnt = jax.tree.leaves(state.estimators, is_leaf=lambda x: isinstance(x, Buffer))
+    learnt = jax.tree.leaves(state.estimators, is_leaf=is_buffer)
     stores = [x for x in learnt if isinstance(x, Buffer)]
     parts = {
-        "num_robots": count_bytes(state.env),
+        "num_robots": config.num_robots * robot_bytes(config, state),
         "hidden_sizes": 2 * count_bytes(state.policy) + count_bytes([x for x in learnt if not isinstance(x, Buffer)]),
         "human_capacity": count_bytes(state.human_data),
         "critic_capacity": count_bytes(stores),
         "num_steps": config.num_steps * 4 * len(Metrics._fields),
     }
+    divided, everywhere = sharding.shares()
+    for name in parts:
+        parts[name] = math.ceil(parts[name] * (divided if name in ("num_robots", "critic_capacity") else everywhere))
     needed, limit = sum(parts.values()), memory()
     if needed > limit:
         largest = max(parts, key=lambda name: parts[name])
@@ -151,11 +190,12 @@ def _layout(state: FleetState) -> FleetState:
 
     def describe(x: Any) -> Any:
         if isinstance(x, Buffer):
-            return x._replace(rows=jax.tree.map(lambda rows: _struct(rows, 1), x.rows), added=_struct(x.added))
+            whole = jax.ShapeDtypeStruct((), x.added.dtype)  # in any number of parts
+            return x._replace(rows=jax.tree.map(lambda rows: _struct(rows, 1), x.rows), added=whole)
         return _struct(x)
 
     data = state.human_data
-    described = jax.tree.map(describe, state, is_leaf=lambda x: isinstance(x, Buffer))
+    described = jax.tree.map(describe, state, is_leaf=is_buffer)
     resample = _struct(data.resample, 1)
     return described._replace(
         human_data=described.human_data._replace(resample=resample), origin=FleetState._field_defaults["origin"]

@@ -7,10 +7,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
-from fleetjax import envs
+from fleetjax import envs, sharding
 from fleetjax.checks import check_run
 from fleetjax.config import Config
+from fleetjax.distribute import alone, place, spread
 from fleetjax.fleet import FleetState, init, logged_step, make_parts
 from fleetjax.keys import key_at
 from fleetjax.learning.imitation import PolicyState, create_data
@@ -33,13 +35,14 @@ class Result(NamedTuple):
 
 
 @in_32_bits
-def prepare(config: Config, key: jax.Array, env: envs.Env | None = None) -> FleetState:
+def prepare(config: Config, key: jax.Array, env: envs.Env | None = None, mesh: Mesh | None = None) -> FleetState:
     """Return the fleet at t = 0: demonstrations collected, policy and critics pre-trained, robots at their start.
 
     Args:
         config: configuration.
         key: random key; `run(config, key)` starts from `prepare(config, key)`.
         env: the environment, if it is not the registered one that the configuration names.
+        mesh: devices among which to divide the robots; None = all on one. Each device does all the pre-training itself.
 
     Collecting whole episodes takes loops whose length depends on what happens in them, so only forward-mode differentiation
     works through this function. `run` from a given state supports both modes where the physics does.
@@ -49,15 +52,25 @@ def prepare(config: Config, key: jax.Array, env: envs.Env | None = None) -> Flee
 
     Reference: paper, Section 5.2.
     """
+    with sharding.over(mesh, config.num_humans):
+        return spread(_prepare(config, key, env))
+
+
+def _prepare(config: Config, key: jax.Array, env: envs.Env | None) -> FleetState:
+    """Return the fleet at t = 0, before it is divided."""
     env = check_run(config, env)
     key_policy, key_estimators, key_reset = jax.random.split(key_at(key, -1), 3)
     parts = make_parts(config, env)
-    policy, data = pretrain(config, env, parts.learner, parts.supervisor, key_policy)
-    estimators = {
-        name: estimator.init(jax.random.fold_in(key_estimators, i), data, policy)
-        for i, (name, estimator) in enumerate(parts.estimators.items())
-    }
-    return init(parts, key_reset, policy, data, estimators)
+
+    def learn() -> tuple[Any, ...]:
+        policy, data = pretrain(config, env, parts.learner, parts.supervisor, key_policy)
+        estimators = {
+            name: estimator.init(jax.random.fold_in(key_estimators, i), data, policy)
+            for i, (name, estimator) in enumerate(parts.estimators.items())
+        }
+        return policy, data, estimators
+
+    return init(parts, key_reset, *alone(learn))
 
 
 def extend(state: FleetState, num_pairs: int) -> FleetState:
@@ -90,7 +103,13 @@ def extend(state: FleetState, num_pairs: int) -> FleetState:
     return state._replace(human_data=data._replace(pairs=pairs, resample=grow(data.resample), weight=weight))
 
 
-def run(config: Config, key: jax.Array, state: FleetState | None = None, env: envs.Env | None = None) -> Result:
+def run(
+    config: Config,
+    key: jax.Array,
+    state: FleetState | None = None,
+    env: envs.Env | None = None,
+    mesh: Mesh | None = None,
+) -> Result:
     """Run a fleet for `config.num_steps` timesteps.
 
     Pure, so you can use `jax.jit`, and `jax.vmap` over keys and configs. Each timestep derives its key from `key`, so a run
@@ -103,23 +122,29 @@ def run(config: Config, key: jax.Array, state: FleetState | None = None, env: en
         key: random key.
         state: where to start; None pre-trains first.
         env: the environment, if it is not the registered one that the configuration names.
+        mesh: devices among which to divide the robots, in equal parts; None = all on one. See docs/scale.md.
 
     Returns:
-        Result: metrics [T] and the last state.
+        Result: metrics [T] and the last state, on a mesh divided over it.
 
     Raises:
-        ValueError: if the configuration is not valid, the run cannot fit the memory, or the state does not fit the
+        ValueError: if the configuration is not valid, the run cannot fit the memory, the number of robots is not a multiple of
+            that of devices, or the state does not fit the
             configuration: it is another environment's or fleet's, its layout differs (other networks, estimators or memory
             of the rule), or it has no room for the pairs that humans can give (`extend` makes room; where the state's
             numbers are traced, `Metrics.dropped` counts what was lost).
 
     Reference: paper, Sections 3 and 4.
     """
-    return simulate(config, key, state, env, logged=False)[0]
+    return simulate(config, key, state, env, mesh, logged=False)[0]
 
 
 def run_logged(
-    config: Config, key: jax.Array, state: FleetState | None = None, env: envs.Env | None = None
+    config: Config,
+    key: jax.Array,
+    state: FleetState | None = None,
+    env: envs.Env | None = None,
+    mesh: Mesh | None = None,
 ) -> tuple[Result, Interventions]:
     """Run a fleet as `run` does, and log what each human who teleoperates saw and did.
 
@@ -128,6 +153,7 @@ def run_logged(
         key: random key.
         state: where to start; None pre-trains first.
         env: the environment, if it is not the registered one that the configuration names.
+        mesh: devices among which to divide the robots; None = all on one.
 
     Returns:
         The Result of `run`, and Interventions[T, M].
@@ -135,26 +161,33 @@ def run_logged(
     Raises:
         ValueError: as `run` does.
     """
-    return simulate(config, key, state, env, logged=True)
+    return simulate(config, key, state, env, mesh, logged=True)
 
 
 @in_32_bits
 def simulate(
-    config: Config, key: jax.Array, state: FleetState | None = None, env: envs.Env | None = None, *, logged: bool
+    config: Config,
+    key: jax.Array,
+    state: FleetState | None = None,
+    env: envs.Env | None = None,
+    mesh: Mesh | None = None,
+    *,
+    logged: bool,
 ) -> tuple[Result, Any]:
     """Return the Result of `run` and, if `logged`, the Interventions[T, M] of `run_logged`; else None."""
-    env = check_run(config, env, state)
-    start = prepare(config, key, env) if state is None else state
+    with sharding.over(mesh, config.num_humans):
+        env = check_run(config, env, state)
+        start = spread(_prepare(config, key, env) if state is None else state)
+        parts = make_parts(config, env)
 
-    parts = make_parts(config, env)
+        def timestep(state: FleetState, _: None) -> tuple[FleetState, Any]:
+            after, outputs = logged_step(parts, state, key_at(key, state.timestep))
+            counts, interventions = sharding.everywhere(outputs)
+            return place(after), (counts, interventions if logged else None)
 
-    def timestep(state: FleetState, _: None) -> tuple[FleetState, Any]:
-        after, (counts, interventions) = logged_step(parts, state, key_at(key, state.timestep))
-        return after, (counts, interventions if logged else None)
-
-    scan = scan_in_blocks if config.allocation == "soft" else jax.lax.scan
-    last, (metrics, interventions) = scan(timestep, start, length=config.num_steps)
-    return Result(metrics, last), interventions
+        scan = scan_in_blocks if config.allocation == "soft" else jax.lax.scan
+        last, (metrics, interventions) = scan(timestep, start, length=config.num_steps)
+        return Result(metrics, last), interventions
 
 
 def step_once(config: Config, env: envs.Env, state: FleetState, key: jax.Array) -> FleetState:

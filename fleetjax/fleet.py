@@ -13,7 +13,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from fleetjax import metrics, priority, soft, supervisors
+from fleetjax import metrics, priority, sharding, soft, supervisors
 from fleetjax.allocation import Allocator, helper_of
 from fleetjax.config import Config
 from fleetjax.envs import Env
@@ -194,7 +194,7 @@ def act(
     humans = planned.humans._replace(duration=jnp.where(planned.humans.robot >= 0, planned.humans.duration + 1, 0))
     correction = jnp.where(given & sound, jnp.mean((human_action - planned.robot_action) ** 2, axis=-1), 0.0)
     taught = Pair(state.env.obs, human_action)
-    before, state = state, remember(parts, state, steps, taught, planned.weight, given & sound, moving & sound, keys)
+    before, state = state, remember(parts, state, planned, steps, taught, given & sound, moving & sound, keys)
     renewed, reset_done = renew(parts, stepped, planned, humans, moving, keys)
     state, loss = learn(parts, state, keys)
     state = state._replace(
@@ -241,17 +241,17 @@ def observe(parts: Parts, state: FleetState, keys: Keys) -> Signals:
 
 def supervise(parts: Parts, env: EnvState, keys: Keys) -> jax.Array:
     """Return f32[N, A], what the simulated supervisor would do on each robot."""
-    return jax.vmap(parts.supervisor.act)(env, keys.human)
+    return sharding.vmap(parts.supervisor.act, env, keys.human)
 
 
 def reset_robots(parts: Parts, keys: jax.Array) -> EnvState:
     """Return EnvState[N], each robot drawn from its own initial distribution by its key of `keys` [N]."""
-    return jax.vmap(parts.env.reset)(keys, jnp.arange(parts.config.num_robots))
+    return sharding.vmap(parts.env.reset, keys, jnp.arange(parts.config.num_robots))
 
 
 def step_robots(parts: Parts, env: EnvState, action: jax.Array, moving: jax.Array, keys: Keys) -> tuple[EnvState, jax.Array]:
     """Step the robots that move; return EnvState[N], and bool[N] whose numbers are finite. The others are in violation."""
-    stepped = jax.vmap(parts.env.step)(env, action, moving, keys.env)
+    stepped = sharding.vmap(parts.env.step, env, action, moving, keys.env)
     if parts.env.spec.success_return is not None:
         stepped = stepped._replace(success=stepped.timeout & (stepped.episode_return > parts.config.success_return))
     stepped = where(moving, stepped, env)
@@ -262,9 +262,9 @@ def step_robots(parts: Parts, env: EnvState, action: jax.Array, moving: jax.Arra
 def remember(
     parts: Parts,
     state: FleetState,
+    planned: Plan,
     steps: Step,
     pairs: Pair,
-    weight: jax.Array | None,
     taught: jax.Array,
     moved: jax.Array,
     keys: Keys,
@@ -272,11 +272,20 @@ def remember(
     """Record what humans did where they `taught` bool[N], and what happened where robots `moved` bool[N]."""
     data = state.human_data
     if parts.algorithm.updates:
-        before, data = data, parts.learner.append(data, pairs, taught, keys.data)
-        if weight is not None:
-            data = imitation.weigh(before, data, weight, taught)
+        choice = None
+        if sharding.division():  # only the rows of humans leave their device
+            choice = imitation.Choice(teaching(planned.humans, taught), parts.config.num_robots)
+            pairs, taught = sharding.everywhere(take(pairs, choice.rows)), choice.rows < choice.number
+        before, data = data, parts.learner.append(data, pairs, taught, keys.data, choice)
+        if planned.weight is not None:
+            data = imitation.weigh(before, data, planned.weight, taught)
     estimators = {name: estimator.append(state.estimators[name], steps, moved) for name, estimator in parts.estimators.items()}
     return state._replace(human_data=data, estimators=estimators)
+
+
+def teaching(humans: HumanState, taught: jax.Array) -> jax.Array:
+    """Return i32[M], the robots among `taught` bool[N] that humans help, in order, then N."""
+    return jnp.sort(jnp.where((humans.robot >= 0) & taught[humans.robot], humans.robot, taught.size))
 
 
 def renew(
@@ -288,7 +297,7 @@ def renew(
     ended = stepped.timeout if next_goal else stepped.timeout | stepped.success
     after = where(reset_done | (moving & ended), reset_robots(parts, keys.reset), stepped)
     if next_goal:
-        with_goal = jax.vmap(next_goal)(after, keys.goal)
+        with_goal = sharding.vmap(next_goal, after, keys.goal)
         after = where(moving & stepped.success & ~ended, with_goal, after)
     return after, reset_done
 
@@ -361,6 +370,6 @@ def _networks(critic: CriticState | None) -> Any:
 
 
 def _all_finite(learnt: Any) -> jax.Array:
-    leaves = jax.tree.leaves(learnt, is_leaf=lambda x: isinstance(x, buffer.Buffer))
+    leaves = jax.tree.leaves(learnt, is_leaf=buffer.is_buffer)
     numbers = [x for x in leaves if not isinstance(x, buffer.Buffer) and jnp.issubdtype(x.dtype, jnp.floating)]
     return sum((jnp.sum(x - x) for x in numbers), jnp.float32(0)) == 0  # inf - inf is NaN; it compiles to little

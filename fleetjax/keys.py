@@ -3,6 +3,9 @@
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
+
+from fleetjax import sharding
 
 
 class Keys(NamedTuple):
@@ -39,5 +42,10 @@ def key_at(key: jax.Array, timestep: jax.Array | int) -> jax.Array:
 
 def split_keys(key: jax.Array, num_robots: int) -> Keys:
     """Return the keys of the timestep whose key is given, by a single split, which compiles and runs fastest."""
-    keys = jax.random.split(key, 4 * (1 + num_robots))
-    return Keys(*keys[:4], *keys[4:].reshape(4, num_robots))
+    if sharding.division() is None:
+        keys = jax.random.split(key, 4 * (1 + num_robots))
+        return Keys(*keys[:4], *keys[4:].reshape(4, num_robots))
+    fold = jax.vmap(jax.random.fold_in, (None, 0))  # the same keys: each device makes those of its own robots alone
+    robot = jnp.arange(num_robots, dtype=jnp.uint32)
+    own = [sharding.pin(fold(key, 4 + kind * num_robots + robot), sharding.DIVIDED) for kind in range(4)]
+    return Keys(*fold(key, jnp.arange(4, dtype=jnp.uint32)), *own)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from fleetjax import sharding
 from fleetjax.allocation import helper_of
 from fleetjax.config import Config
 from fleetjax.types import EnvState, HumanState, Plan
@@ -134,8 +135,8 @@ def measure(
         risk_choices=count(chosen & moving & certain & at_risk),
         dropped=dropped,
         diverged=diverged,
-        reward=jnp.sum(jnp.where(moving, stepped.reward, 0.0)),
-        uncertainty=jnp.sum(jnp.where(moving, planned.signals.uncertainty, 0.0))
+        reward=sharding.total(jnp.where(moving, stepped.reward, 0.0)),
+        uncertainty=sharding.total(jnp.where(moving, planned.signals.uncertainty, 0.0))
         / jnp.maximum(count(moving), 1).astype(jnp.float32),
         policy_loss=loss,
     )

@@ -39,6 +39,7 @@ def pytest_configure(config: pytest.Config) -> None:
     import jax  # only now, since it reads the environment
 
     jax.config.update("jax_numpy_dtype_promotion", "strict")
+    jax.config.update("jax_num_cpu_devices", 8)  # virtual ones, for `test_mesh.py`; others use the first
 
 
 @pytest.fixture(params=["quickly", pytest.param("optimized", marks=pytest.mark.slow)])

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fleetjax.envs import allegro_hand
+from fleetjax.envs.rotation import multiply
 from fleetjax.physics.base import make_physics
 
 NAMES = [f"{finger}_{joint}" for finger in ("index", "middle", "ring", "thumb") for joint in range(4)]
@@ -295,3 +296,17 @@ def test_the_view_entry_by_entry(turned):
 def test_the_view_at_the_goal_is_finite(physics):
     obs = allegro_hand.observe(hand(physics), LOW, HIGH)
     np.testing.assert_allclose(allegro_hand.view(obs)[62:69], 0, atol=1e-6)
+
+
+@pytest.mark.parametrize("angle", [0.05, 0.099, 0.101, 1.0, np.pi])
+def test_the_success_margin_is_the_distance_from_the_tolerance_and_has_a_derivative(physics, env, start, angle):
+    def margin(turn):
+        goal = jnp.roll(jnp.asarray(Rotation.from_euler("zyx", [0.3, 0.2, 0.1]).as_quat(), jnp.float32), 1)
+        turned = jnp.concatenate([jnp.cos(turn / 2)[None], jnp.sin(turn / 2) * jnp.array([0.6, 0.0, 0.8])])
+        state = start._replace(physics=hand(physics, turn=multiply(turned, goal), goal=goal))
+        return env.success_margin(state)
+
+    value, slope = jax.value_and_grad(margin)(jnp.float32(angle))
+    np.testing.assert_allclose(value, 1 - np.sin(angle / 2) / np.sin(0.05), rtol=1e-4, atol=1e-4)
+    assert (value > 0) == (angle <= allegro_hand.TOLERANCE)
+    np.testing.assert_allclose(slope, -0.5 * np.cos(angle / 2) / np.sin(0.05), rtol=1e-3, atol=1e-4)

@@ -26,6 +26,7 @@ def test_environments_that_ship_pass(name):
 
 def test_toys_pass():
     fleetjax.check_env(GOOD)
+    fleetjax.check_env(GOOD._replace(success_margin=lambda state: jnp.where(state.success, 1.0, -1.0)))
     fleetjax.check_env(toy_envs.scripted([0] * 4, [0] * 4, horizon=7))
 
 
@@ -71,6 +72,10 @@ FAULTY = {
     "no time-out": (
         stepping(lambda a, b: b._replace(timeout=jnp.bool_(False))),
         r"reaches spec\.horizon = 20 must set timeout",
+    ),
+    "margin": (
+        GOOD._replace(success_margin=lambda state: jnp.float32(-1)),
+        "success_margin must be above 0 where a step set success",
     ),
     "early": (stepping(lambda a, b: b._replace(timeout=~b.violation)), r"timeout must not be set before spec\.horizon = 20"),
 }

@@ -142,7 +142,7 @@ def human_freed_by_a_soft_reset(patch, config, env):
 @fault("cu", "number of human data")
 def pair_recorded_that_nobody_gave(patch, config, env):
     real = imitation.append
-    patch.setattr(imitation, "append", lambda data, pairs, mask, key: real(data, pairs, jnp.ones_like(mask), key))
+    patch.setattr(imitation, "append", lambda data, pairs, mask, key, choice=None: real(data, pairs, jnp.ones_like(mask), key))
     return make_fleet(config, env)
 
 

@@ -1,6 +1,7 @@
 """The notebooks: they run (at a small size, among the slow tests), and what is committed is what a full run printed."""
 
 import re
+import shutil
 from pathlib import Path
 
 import nbformat
@@ -52,4 +53,6 @@ def test_a_notebook_runs(notebook, tmp_path, monkeypatch):
     cell.source = re.sub(r"^(\w+) = .*$", lambda found: f"{found[1]} = {SMALL[found[1]]}", cell.source, flags=re.MULTILINE)
     monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path))
+    for rows in FOLDER.glob("*.csv"):
+        shutil.copy(rows, tmp_path)
     NotebookClient(notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": tmp_path}}).execute()

@@ -62,10 +62,9 @@ def test_an_order_is_that_of_python_tuples(name, signals):
         "u": thresholded(signals.uncertainty, 0.3),
         "r": thresholded(signals.risk, 0.5),
     }
-    rows = list(zip(*(values[letter] for letter in letters), strict=True))
     postponed = signals.violation & (signals.timestep < 10) & ("c" in name)
-    expected = [0.0 if late else rank for late, rank in zip(postponed, oracle.rank(rows), strict=True)]
-    assert score(name, signals).tolist() == expected
+    rows = zip(*(np.where(postponed, 0.0, values[letter]).tolist() for letter in letters), strict=True)
+    assert score(name, signals).tolist() == oracle.rank(list(rows))
 
 
 @pytest.mark.parametrize("name", [name for name in ORDERS if "c" in name])

@@ -103,6 +103,10 @@ CASES = {
             row("4", r"[\d,.]+", r"[\d,.]+", r"[\d.]+"),
         ),
     ),
+    "benchmarks/large.py": Case(
+        (f"--num-steps 2 -- {FLEET}",),
+        (row("navigation", r"\d+", r"[\d,]+", r"[\d.]+", r"-?[\d,]+", r"[\d,]+"), row("8", r"\d+", r"[\d.]+", r"[\d.]+")),
+    ),
     "benchmarks/physics.py": Case(
         ("humanoid --num-robots 4 --largest-mjx 0 --repeats 1",),
         (row("humanoid", "4", "raw rollout", r"[\d,]+", "1.00"), row("humanoid", "4", "native", r"[\d,]+", r"[\d.]+")),

@@ -304,10 +304,20 @@ def compiled():
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory, compiled):
     """Metrics and policies of plain runs, by seed; only the first compiles."""
-    path = tmp_path_factory.mktemp("plain")
+    return plain_runs(tmp_path_factory.mktemp("plain"), compiled, STEPS)
+
+
+@pytest.fixture(scope="module")
+def whole_long(tmp_path_factory, compiled):
+    """The same of runs that are too long to end before a signal arrives."""
+    return plain_runs(tmp_path_factory.mktemp("long"), compiled, 10 * STEPS)
+
+
+def plain_runs(path: Path, compiled: list[float], steps: int) -> dict[int, list[bytes]]:
     for seed in range(3):
         compiled.clear()
-        assert cli.main(["run", "navigation", *RANDOM, "--seed", str(seed), "--output", str(path / str(seed))]) == 0
+        length = ("--num-steps", str(steps), "--seed", str(seed))
+        assert cli.main(["run", "navigation", *RANDOM, *length, "--output", str(path / str(seed))]) == 0
         assert (len(compiled) >= 2) == (seed == 0)
     return {seed: results(path / str(seed)) for seed in range(3)}
 
@@ -536,52 +546,46 @@ def test_jobs_of_a_cluster_take_over_what_dead_ones_leave(tmp_path, spawn, whole
         assert "resuming from" in (output / "logs" / f"navigation-random-seed{seed}.log").read_text()
 
 
+def test_ctrl_c_while_a_process_starts_reaches_its_parent_alone():
+    with resumable.stoppable() as asked_to_stop:
+        with crew.deaf_to_ctrl_c():
+            child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE, stderr=subprocess.PIPE)
+            os.kill(os.getpid(), signal.SIGINT)
+            child.send_signal(signal.SIGINT)
+        assert asked_to_stop()
+    assert child.communicate(b"\n") == (None, b"")
+    assert child.returncode == 0
+
+
 @pytest.mark.slow
-def test_stopped_jobs_write_checkpoints_and_the_same_command_resumes(tmp_path, spawn):
-    output, steps = tmp_path / "out", 20 * STEPS
-    jobs = ("--launcher", "local", "--jobs", 2, "--lease", 30, "--checkpoint-every", 0)
-    command = ("sweep", "navigation", *RANDOM, "--num-steps", steps, "--seeds", 3, *jobs, "--output", output)
+@pytest.mark.parametrize(
+    ("options", "stop"),
+    [
+        (["--workers", 2], os.killpg),  # as a terminal does
+        (["--workers", 1], os.kill),
+        (["--launcher", "local", "--jobs", 2, "--lease", 30], os.killpg),
+    ],
+)
+def test_a_stopped_sweep_writes_checkpoints_and_resumes(tmp_path, spawn, whole_long, options, stop):
+    output, steps = tmp_path / "out", 10 * STEPS
+    command = ("sweep", "navigation", *RANDOM, "--num-steps", steps, "--seeds", 3, *options, "--checkpoint-every", 0)
+    command += ("--output", output)
     process = spawn(*command)
     with contextlib.ExitStack() as stack:
         stack.callback(process.kill)
         wait_until(lambda: rows(the_run(output, 0)) > 200, process)
-        working = owner(the_run(output, 0))
-        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
-        code, _, said = end(process)
-    assert code == 130
-    assert said[-1] == "fleetjax: interrupted with 0 of 3 runs finished; repeat the command to resume"
-    wait_for_end([working])
-    assert 200 < rows(the_run(output, 0)) < steps
-    assert list(the_run(output, 0).glob("checkpoints/*/manifest.json"))
-    assert json.loads((output / "leases" / "navigation-random-seed0" / "0").read_text())["end"] == "stopped"
-    code, _, said = end(spawn(*command))
-    assert code == 0, said
-    assert [rows(the_run(output, seed)) for seed in range(3)] == [steps] * 3
-    assert "resuming from" in (output / "logs" / "navigation-random-seed0.log").read_text()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("number", "together"), [(signal.SIGINT, 2), (signal.SIGTERM, 1)])
-def test_a_stopped_sweep_writes_checkpoints_and_resumes(tmp_path, spawn, whole, number, together):
-    output = tmp_path / "out"
-    command = ("sweep", "navigation", *RANDOM, "--seeds", 3, "--workers", together, "--checkpoint-every", 0, "--output", output)
-    process = spawn(*command)
-    with contextlib.ExitStack() as stack:
-        stack.callback(process.kill)
-        wait_until(lambda: rows(the_run(output, 0)) > 200, process)
-        workers = children(process)
-        if number == signal.SIGINT:
-            os.killpg(process.pid, number)  # as a terminal does
-        else:
-            process.send_signal(number)
+        working = [owner(the_run(output, 0))] if "--launcher" in options else children(process)
+        stop(process.pid, signal.SIGINT if stop is os.killpg else signal.SIGTERM)
         code, out, said = end(process)
     assert (code, out) == (130, "")
-    assert re.fullmatch("fleetjax: interrupted with [0-2] of 3 runs finished; repeat the command to resume", said[-1])
-    wait_for_end(workers)
-    assert together == 2 or not the_run(output, 1).exists()
-    assert 200 < rows(the_run(output, 0)) < STEPS
+    assert said[-1] == "fleetjax: interrupted with 0 of 3 runs finished; repeat the command to resume"
+    wait_for_end(working)
+    assert 200 < rows(the_run(output, 0)) < steps
+    assert options != ["--workers", 1] or not the_run(output, 1).exists()
     assert list(the_run(output, 0).glob("checkpoints/*/manifest.json"))
+    if "--launcher" in options:
+        assert json.loads((output / "leases" / "navigation-random-seed0" / "0").read_text())["end"] == "stopped"
     code, _, said = end(spawn(*command))
     assert code == 0, said
-    assert [results(the_run(output, seed)) for seed in range(3)] == [whole[seed] for seed in range(3)]
+    assert [results(the_run(output, seed)) for seed in range(3)] == [whole_long[seed] for seed in range(3)]
     assert "resuming from" in (output / "logs" / "navigation-random-seed0.log").read_text()

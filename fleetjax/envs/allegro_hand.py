@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fleetjax.envs import base
-from fleetjax.envs.rotation import angle_between, conjugate, multiply, rotation_matrix
+from fleetjax.envs.rotation import angle_between, conjugate, multiply, rotation_matrix, sine_of_half_angle
 from fleetjax.physics.base import MODELS, PhysicsState, make_physics
 from fleetjax.types import EnvState
 
@@ -96,7 +96,10 @@ def make_env(*, backend: str = "auto", tolerance: float = TOLERANCE) -> base.Env
     def pose(state: EnvState) -> tuple[jax.Array, jax.Array]:
         return state.physics.body.qpos, jnp.concatenate([SHOWN_AT, state.physics.goal])[None]
 
-    return base.Env(reset, step, spec, next_goal, base.Scene(physics.model, pose))
+    def success_margin(state: EnvState) -> jax.Array:
+        return 1.0 - sine_of_half_angle(state.physics.body.qpos[19:23], state.physics.goal) / np.sin(tolerance / 2)
+
+    return base.Env(reset, step, spec, next_goal, base.Scene(physics.model, pose), success_margin=success_margin)
 
 
 def angles(target: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:

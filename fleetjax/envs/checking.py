@@ -107,7 +107,7 @@ def _differences(first: EnvState, after: Any) -> Iterator[str]:
 def _faults_in_motion(env: Env) -> Iterator[str]:
     """Yield what is wrong with some episodes under random actions."""
     played = jax.lax.map(lambda key: _play(env, key), jax.random.key(0)[None])  # as one program
-    first, after, last = jax.tree.map(lambda x: x[0], jax.device_get(played))
+    first, after, last, margin = jax.tree.map(lambda x: x[0], jax.device_get(played))
     moved = ~np.concatenate([first.violation[None], after.violation[:-1]])
     if any(np.any(getattr(first, name)) for name in ("reward", "success", "timeout", "episode_return", "episode_step")):
         yield "reset must set reward, success, timeout, episode_return and episode_step to 0, as envs.begin does"
@@ -123,14 +123,19 @@ def _faults_in_motion(env: Env) -> Iterator[str]:
     for name in ("success", "timeout"):
         if np.any(getattr(after, name) & after.violation):
             yield f"a violation beats {name}: both must not be set at once"
+    if margin is not None and np.any(((margin > 0) & ~after.violation) != after.success):
+        yield "success_margin must be above 0 where a step set success, and nowhere else but in a violation"
     if not np.all(last.timeout | last.violation):
         yield f"the step that reaches spec.horizon = {env.spec.horizon} must set timeout, unless it violates the constraint"
     if np.any(after.timeout[moved & (after.episode_step < env.spec.horizon)]):
         yield f"timeout must not be set before spec.horizon = {env.spec.horizon} steps"
 
 
-def _play(env: Env, key: jax.Array) -> tuple[EnvState, EnvState, EnvState]:
-    """Return EnvState[N] at first, [T, N] under random actions, and [N] after a step that reaches the horizon."""
+def _play(env: Env, key: jax.Array) -> tuple[EnvState, EnvState, EnvState, jax.Array | None]:
+    """Return EnvState[N] at first, [T, N] under random actions, and [N] after a step that reaches the horizon.
+
+    The last one is the success margin f32[T, N] under random actions, or None if the environment has none.
+    """
     key_reset, key_steps, key_last = jax.random.split(key, 3)
 
     def step(state: EnvState, key: jax.Array) -> tuple[EnvState, EnvState]:
@@ -146,7 +151,8 @@ def _play(env: Env, key: jax.Array) -> tuple[EnvState, EnvState, EnvState]:
     first = jax.vmap(env.reset)(jax.random.split(key_reset, NUM_ROBOTS), jnp.arange(NUM_ROBOTS))
     _, after = jax.lax.scan(step, first, jax.random.split(key_steps, min(NUM_STEPS, env.spec.horizon)))
     almost = first._replace(episode_step=jnp.full(NUM_ROBOTS, env.spec.horizon - 1, jnp.int32))
-    return first, after, step(almost, key_last)[0]
+    margin = jax.vmap(jax.vmap(env.success_margin))(after) if env.success_margin else None
+    return first, after, step(almost, key_last)[0], margin
 
 
 def _shown(x: Any) -> str:

@@ -27,6 +27,11 @@ def conjugate(quaternion: jax.Array) -> jax.Array:
     return quaternion * jnp.array([1.0, -1.0, -1.0, -1.0])
 
 
+def sine_of_half_angle(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Return the sine f32[] of half the angle between two orientations f32[4]; its derivative stays finite up to pi."""
+    return jnp.linalg.norm(multiply(a, conjugate(b))[1:])
+
+
 def angle_between(a: jax.Array, b: jax.Array) -> jax.Array:
     """Return by how much two orientations f32[4] differ, f32[] (rad, in [0, pi])."""
-    return 2.0 * jnp.arcsin(jnp.minimum(1.0, jnp.linalg.norm(multiply(a, conjugate(b))[1:])))
+    return 2.0 * jnp.arcsin(jnp.minimum(1.0, sine_of_half_angle(a, b)))

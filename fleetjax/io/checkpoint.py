@@ -17,9 +17,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from fleetjax.fleet import FleetState
 from fleetjax.io import files
+from fleetjax.learning.buffer import Buffer, is_buffer
 
 FOLDER, ARRAYS, MANIFEST = "checkpoints", "arrays", "manifest.json"
 KEPT = 2
@@ -78,16 +80,116 @@ class Writer:
             shutil.rmtree(path, ignore_errors=True)
             path.mkdir(parents=True)
             _checkpointer(lambda orbax: orbax.save((path / ARRAYS).absolute(), arrays))
-            manifest = {"timestep": timestep, **self.identity, "notes": notes, "sha256": _digests(path)}
-            files.write_json(path / MANIFEST, manifest)
+            _finish(path, {"timestep": timestep, **self.identity, "notes": notes})
         except Exception as error:  # orbax passes on what its storage raises, of any kind
             shutil.rmtree(path, ignore_errors=True)
             raise OSError(f"the checkpoint at t = {timestep} could not be written ({files.one_line(error)})") from error
-        found = _found(self.folder)
-        kept = [path for path in found if (path / MANIFEST).exists()][-KEPT:]
-        for other in found:
-            if other not in kept:
-                shutil.rmtree(other)
+        _prune(self.folder)
+
+
+def _finish(path: Path, manifest: Mapping[str, Any]) -> None:
+    files.write_json(path / MANIFEST, {**manifest, "sha256": _digests(path)})
+
+
+def _prune(folder: Path) -> None:
+    """Keep the last finished checkpoints."""
+    found = _found(folder)
+    kept = [path for path in found if (path / MANIFEST).exists()][-KEPT:]
+    for other in found:
+        if other not in kept:
+            shutil.rmtree(other)
+
+
+def write_shares(
+    folder: Path,
+    identity: Mapping[str, Any],
+    state: FleetState,
+    notes: Mapping[str, Any],
+    *,
+    leads: bool,
+    meet: Callable[[str], None],
+) -> None:
+    """Write a checkpoint of a fleet on a mesh: each process its share, then the one that `leads` the manifest.
+
+    Args:
+        folder: folder of the run, on a file system that all processes share.
+        identity: the run's.
+        state: the fleet.
+        notes: what to note with it.
+        leads: whether this process leads.
+        meet: waits for all processes.
+    """
+    path = folder / FOLDER / f"{int(state.timestep):010}"
+    if leads:
+        shutil.rmtree(path, ignore_errors=True)
+        path.mkdir(parents=True)
+    meet("a checkpoint begins")
+    arrays = _named(state, _plain)
+    _checkpointer(lambda orbax: orbax.save((path / ARRAYS).absolute(), arrays))
+    meet("its shares are written")
+    if leads:
+        parts = {"parts": max((x.added.size for x in _rings(state)), default=1)}
+        _finish(path, {"timestep": int(state.timestep), **identity, **parts, "notes": dict(notes)})
+        _prune(folder / FOLDER)
+    meet("it is finished")
+
+
+def newest(
+    folder: Path, identity: Mapping[str, Any], check: Callable[[Mapping[str, Any]], Any]
+) -> tuple[Path | None, list[str]]:
+    """Return the newest checkpoint whose files are intact, or None, and for each newer one the reason why it cannot be used.
+
+    Args:
+        folder: folder of the run.
+        identity: the run's.
+        check: raises ValueError for notes that do not fit the run's other files.
+    """
+    refused = []
+    for path in reversed(_found(folder / FOLDER)):
+        try:
+            check(_manifest(path, identity)["notes"])
+            return path, refused
+        except ValueError as error:
+            refused.append(f"{path}: {files.one_line(error)}")
+    return None, refused
+
+
+def read_shares(
+    path: Path, identity: Mapping[str, Any], shapes: Callable[[int], FleetState], mesh: Mesh
+) -> tuple[FleetState, Mapping[str, Any]]:
+    """Read a checkpoint onto a mesh, of any size: each process what its devices hold.
+
+    Args:
+        path: the checkpoint.
+        identity: the run's.
+        shapes: the structure of its state, by the number of parts of its rings.
+        mesh: whose devices hold it.
+
+    Returns:
+        The state, whose rings have as many parts as when it was written, and the notes.
+    """
+    manifest = _manifest(path, identity)
+    wanted = shapes(manifest.get("parts", 1))
+
+    def struct(leaf: Any) -> jax.ShapeDtypeStruct:
+        shape, dtype = _layout(leaf)
+        divided = bool(shape) and shape[0] % mesh.size == 0
+        spec = PartitionSpec(mesh.axis_names[0]) if divided else PartitionSpec()
+        return jax.ShapeDtypeStruct(shape, dtype, sharding=NamedSharding(mesh, spec))
+
+    found = _checkpointer(lambda orbax: orbax.restore((path / ARRAYS).absolute(), _named(wanted, struct)))
+    names, leaves = zip(*jax.tree_util.tree_leaves_with_path(wanted), strict=True)
+
+    def restored(name: str, leaf: Any) -> Any:
+        array = found[name] if leaf.size else jnp.zeros(*_layout(leaf))
+        return jax.random.wrap_key_data(array) if _is_key(leaf) else array
+
+    arrays = [restored(jax.tree_util.keystr(name), leaf) for name, leaf in zip(names, leaves, strict=True)]
+    return jax.tree.unflatten(jax.tree.structure(wanted), arrays), manifest["notes"]
+
+
+def _rings(state: FleetState) -> list[Buffer]:
+    return list(filter(is_buffer, jax.tree.leaves(state.estimators, is_leaf=is_buffer)))
 
 
 def clear(folder: Path) -> None:
@@ -139,6 +241,23 @@ def _read(path: Path, identity: Mapping[str, Any], shapes: FleetState) -> Checkp
     Raises:
         ValueError: if it is unfinished, damaged or belongs to another run.
     """
+    manifest = _manifest(path, identity)
+    template = _named(shapes, lambda x: np.zeros(*_layout(x)))
+    found = _checkpointer(lambda orbax: orbax.restore((path / ARRAYS).absolute(), template))
+    names, leaves = zip(*jax.tree_util.tree_leaves_with_path(shapes), strict=True)
+    arrays = [_restored(found, jax.tree_util.keystr(name), leaf) for name, leaf in zip(names, leaves, strict=True)]
+    state: FleetState = jax.tree.unflatten(jax.tree.structure(shapes), arrays)
+    if int(state.timestep) != manifest.get("timestep"):
+        raise ValueError("its timestep does not match the manifest")
+    return Checkpoint(path, state, manifest["notes"])
+
+
+def _manifest(path: Path, identity: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the manifest of an intact checkpoint.
+
+    Raises:
+        ValueError: if it is unfinished, damaged or belongs to another run.
+    """
     if not (path / MANIFEST).exists():
         raise ValueError("it was never finished")
     try:
@@ -151,14 +270,7 @@ def _read(path: Path, identity: Mapping[str, Any], shapes: FleetState) -> Checkp
         raise ValueError("it belongs to another run")
     if manifest.get("sha256") != _digests(path):
         raise ValueError("its SHA-256 digests do not match the manifest, so it is damaged")
-    template = _named(shapes, lambda x: np.zeros(*_layout(x)))
-    found = _checkpointer(lambda orbax: orbax.restore((path / ARRAYS).absolute(), template))
-    names, leaves = zip(*jax.tree_util.tree_leaves_with_path(shapes), strict=True)
-    arrays = [_restored(found, jax.tree_util.keystr(name), leaf) for name, leaf in zip(names, leaves, strict=True)]
-    state: FleetState = jax.tree.unflatten(jax.tree.structure(shapes), arrays)
-    if int(state.timestep) != manifest.get("timestep"):
-        raise ValueError("its timestep does not match the manifest")
-    return Checkpoint(path, state, manifest["notes"])
+    return manifest
 
 
 def _checkpointer(use: Callable[[Any], Any]) -> Any:
@@ -203,7 +315,7 @@ def _layout(leaf: Any) -> tuple[tuple[int, ...], Any]:
     return plain.shape, plain.dtype
 
 
-def _named(state: FleetState, value: Callable[[Any], np.ndarray]) -> dict[str, np.ndarray]:
+def _named(state: FleetState, value: Callable[[Any], Any]) -> dict[str, Any]:
     """Return the value of each leaf by its name; without empty arrays, which orbax does not take."""
     leaves = jax.tree_util.tree_leaves_with_path(state)
     return {jax.tree_util.keystr(name): value(leaf) for name, leaf in leaves if leaf.size}

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 
 from fleetjax.config import Config
 from fleetjax.experiment import evaluate, prepare, simulate, without_teleoperation
@@ -58,7 +59,7 @@ def chunks_of(num_steps: int, length: int) -> list[int]:
 
 
 # The state's memory is used again: buffers can be large.
-_advance = jax.jit(simulate, static_argnames="logged", donate_argnames="state")
+_advance = jax.jit(simulate, static_argnames=("mesh", "logged"), donate_argnames="state")
 
 
 def start(config: Config, key: jax.Array, length: int, *, logged: bool = False) -> FleetState:
@@ -79,7 +80,13 @@ def start(config: Config, key: jax.Array, length: int, *, logged: bool = False) 
 
 
 def run_chunks(
-    config: Config, key: jax.Array, state: FleetState, lengths: list[int], *, logged: bool = False
+    config: Config,
+    key: jax.Array,
+    state: FleetState,
+    lengths: list[int],
+    *,
+    logged: bool = False,
+    mesh: Mesh | None = None,
 ) -> Iterator[tuple[Chunk, FleetState]]:
     """Run chunk after chunk; together they are `run(config, key, state)`.
 
@@ -89,12 +96,13 @@ def run_chunks(
         state: where to start; its memory is taken over.
         lengths: timesteps of each chunk.
         logged: whether to log interventions.
+        mesh: over which the state is divided; None = it is not.
 
     Yields:
         Chunk in numpy arrays and the state behind it, valid until the next one is asked for.
     """
     for length in lengths:
-        (metrics, state), interventions = _advance(config.replace(num_steps=length), key, state, logged=logged)
+        (metrics, state), interventions = _advance(config.replace(num_steps=length), key, state, mesh=mesh, logged=logged)
         yield jax.device_get(Chunk(metrics, interventions)), state
 
 

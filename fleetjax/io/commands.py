@@ -10,8 +10,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from fleetjax import envs
-from fleetjax.checks import check_run
+from fleetjax import envs, sharding
+from fleetjax.checks import check_mesh, check_run
 from fleetjax.config import Config, make_config
 from fleetjax.console.controls import CONTROLS
 from fleetjax.envs import get_defaults, list_envs
@@ -52,6 +52,9 @@ def _refusing() -> Iterator[None]:
 def run_fleet(arguments: argparse.Namespace) -> None:
     """Run a new fleet, or resume a run."""
     given = _parameters(arguments)
+    if arguments.distributed:
+        _run_together(arguments, given)
+        return
     with _refusing():
         resumable.check_interval(arguments.checkpoint_every)
         run = _run_to_resume(arguments, given) if arguments.resume else _new_run(arguments, given)
@@ -67,6 +70,29 @@ def run_fleet(arguments: argparse.Namespace) -> None:
         else:
             options = {"resume": bool(arguments.resume), "checkpoint_every": arguments.checkpoint_every}
             metrics = resumable.run_in_folder(run, **options)
+        _report(run, metrics, f"{text.duration(time.monotonic() - begun)} in all")
+
+
+def _run_together(arguments: argparse.Namespace, given: Mapping[str, Any]) -> None:
+    """Run a fleet, or resume it, with all devices of several processes."""
+    if arguments.resume or arguments.overwrite or arguments.log_interventions:
+        raise Refusal(
+            "--distributed resumes by itself and logs no interventions; omit --resume, --overwrite, --log-interventions"
+        )
+    if arguments.output is None:
+        raise Refusal("--distributed needs --output DIR, on a file system that all processes share")
+    from fleetjax.io import team, together  # imported on demand
+
+    begun = time.monotonic()
+    with _refusing():
+        resumable.check_interval(arguments.checkpoint_every)
+        team.join(team.Meeting(arguments.coordinator, arguments.num_processes, arguments.process_id, arguments.connect_timeout))
+        run = _new_run(arguments, given)
+        with sharding.over(team.mesh(), run.config.num_humans):
+            check_mesh(run.config)
+    options = {"checkpoint_every": arguments.checkpoint_every, "step_timeout": arguments.step_timeout}
+    metrics = together.complete(run, **options)
+    if metrics:
         _report(run, metrics, f"{text.duration(time.monotonic() - begun)} in all")
 
 

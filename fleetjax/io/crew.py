@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Iterator, Sequence
+from multiprocessing import resource_tracker
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
@@ -53,12 +54,16 @@ class _Worker:
 
 @contextlib.contextmanager
 def deaf_to_ctrl_c() -> Iterator[None]:
-    """Let a process that is started meanwhile ignore Ctrl-C, which a terminal sends to all: its parent tells it to stop."""
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Let a process that is started meanwhile not hear Ctrl-C, which a terminal sends to all: its parent tells it to stop.
+
+    The signal is blocked, not ignored: one that arrives meanwhile reaches this process afterwards.
+    """
+    resource_tracker.ensure_running()  # which would unblock it when it starts with the first process
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 class Crew:

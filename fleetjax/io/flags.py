@@ -215,7 +215,22 @@ def _add_run(commands: Any, environment: str | None) -> None:
     run.add_argument(
         "--log-interventions", action="store_true", help="log what teleoperating humans see and do, for `fleetjax export`"
     )
+    _add_distribution(run)
     _add_parameters(run, environment)
+
+
+def _add_distribution(run: Any) -> None:
+    group = run.add_argument_group("one fleet over many devices", "The same command, started again, resumes.")
+    every = "divide the robots among all devices of all processes; needs --output, on a file system that they share"
+    group.add_argument("--distributed", action="store_true", help=every)
+    place = "where process 0 listens; not needed under SLURM, nor with --num-processes 1"
+    group.add_argument("--coordinator", metavar="HOST:PORT", help=place)
+    group.add_argument("--num-processes", metavar="P", type=_integer, help="number of processes")
+    group.add_argument("--process-id", metavar="I", type=_integer, help="which of them this is, from 0 to P - 1")
+    wait = "seconds to wait for the other processes at the start [default: 60]"
+    group.add_argument("--connect-timeout", metavar="S", type=_integer, default=60, help=wait)
+    hang = "end if no chunk of timesteps, about a hundredth of the run, is finished for S seconds [default: 1800]"
+    group.add_argument("--step-timeout", metavar="S", type=_integer, default=1800, help=hang)
 
 
 def _add_sweep(commands: Any, environment: str | None) -> None:

@@ -68,8 +68,12 @@ class Journal:
 
     def save(self, state: FleetState) -> None:
         """Write a checkpoint in the background, with what is needed to cut the files back to it."""
-        self._writer.write(state, {name: log.mark() for name, log in self._logs.items()})
+        self._writer.write(state, self.marks())
         self._saved = self.timestep
+
+    def marks(self) -> dict[str, Any]:
+        """Put what was written on the disk; return what is needed to cut the files back to it."""
+        return {name: log.mark() for name, log in self._logs.items()}
 
     def finish(self) -> None:
         """Wait until all checkpoints are written.

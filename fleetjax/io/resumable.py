@@ -69,16 +69,26 @@ def complete(run: folder.Run, *, checkpoint_every: int) -> Metrics:
     with files.lock(run.folder):
         begun = folder.is_run(run.folder)
         if begun:
-            asked, run = run, folder.read_run(run.folder)
-            difference = folder.first_difference(asked, run)
-            if difference:
-                raise ValueError(f"{difference} in {run.folder}; choose another --output")
+            run = read_same(run)
             finished = folder.read_finished(run)
             if finished:
                 return finished
         else:
             folder.check_folder(run.folder, overwrite=False)
         return run_in_folder(run, resume=begun, checkpoint_every=checkpoint_every)
+
+
+def read_same(asked: folder.Run) -> folder.Run:
+    """Return what a folder holds of the run that is asked for.
+
+    Raises:
+        ValueError: if it holds another run, or a damaged one.
+    """
+    run = folder.read_run(asked.folder)
+    difference = folder.first_difference(asked, run)
+    if difference:
+        raise ValueError(f"{difference} in {run.folder}; choose another --output")
+    return run
 
 
 def run_in_folder(run: folder.Run, *, resume: bool, checkpoint_every: int) -> Metrics:
@@ -173,10 +183,10 @@ def _resume(run: folder.Run) -> Start | None:
     say(f"resuming from {found.path}")
     data = files.beginning(run.folder / folder.METRICS, found.notes["metrics"])
     metrics = metrics_csv.parse(data, run.config.num_steps)
-    return Start(_under_versions_of_today(run, int(found.state.timestep)), found.state, metrics, found.notes)
+    return Start(under_versions_of_today(run, int(found.state.timestep)), found.state, metrics, found.notes)
 
 
-def _under_versions_of_today(run: folder.Run, timestep: int) -> folder.Run:
+def under_versions_of_today(run: folder.Run, timestep: int) -> folder.Run:
     """Return a run with the versions that it continues under; say so if they are others than before."""
     run = folder.resumed(run, timestep)
     if run.versions[-1]["timestep"] == timestep:

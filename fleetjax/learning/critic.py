@@ -15,7 +15,7 @@ from fleetjax.envs import EnvSpec
 from fleetjax.learning import buffer
 from fleetjax.learning.imitation import Learner, PolicyState, stored_obs
 from fleetjax.learning.networks import ADAM, Normalizer, descend, make_network
-from fleetjax.tree import take, where
+from fleetjax.tree import where
 
 TWINS = 2
 
@@ -113,7 +113,7 @@ def make_critic(kind: str, config: Config, spec: EnvSpec, learner: Learner) -> C
         index = buffer.draw_index(key, (2, config.batch_size), sizes[:, None])
         wanted = jnp.arange(config.batch_size) < jnp.round(config.positive_fraction * config.batch_size).astype(jnp.int32)
         positive = (wanted & (state.positives.size > 0)) | (state.negatives.size == 0)
-        batch = where(positive, take(state.positives.rows, index[0]), take(state.negatives.rows, index[1]))
+        batch = where(positive, buffer.read(state.positives, index[0]), buffer.read(state.negatives, index[1]))
         return batch, jnp.where(positive, *sizes) > 0
 
     def update(state: CriticState, policy: PolicyState, key: jax.Array) -> CriticState:

@@ -11,7 +11,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
+from jax.sharding import PartitionSpec
 
+from fleetjax import sharding
 from fleetjax.config import Config
 from fleetjax.envs import EnvSpec
 from fleetjax.learning import buffer
@@ -75,13 +77,29 @@ def stored_obs(spec: EnvSpec) -> jax.Array:
     return jnp.zeros(spec.observation_size, jnp.uint8 if spec.image_shape else jnp.float32)
 
 
-def append(data: HumanData, pairs: Pair, mask: jax.Array, key: jax.Array) -> HumanData:
+class Choice(NamedTuple):
+    """Rows that were chosen from others.
+
+    Attributes:
+        rows: i32[K] which they are; `number` for none.
+        number: how many there were.
+    """
+
+    rows: jax.Array
+    number: int
+
+
+def append(data: HumanData, pairs: Pair, mask: jax.Array, key: jax.Array, choice: Choice | None = None) -> HumanData:
     """Add the pairs [K] where `mask` bool[K] holds. For each, every member resamples one of all pairs so far.
+
+    Pairs that are a `choice` draw what they would draw among all.
 
     Reference: paper, Section 4.2 (ensemble bootstrapped on subsets of the training data).
     """
     grown = buffer.append(data.pairs, pairs, mask, overwrite=False)
-    draws = buffer.draw_index(key, (data.resample.shape[1], mask.shape[0]), grown.size)
+    among = mask.shape[0] if choice is None else choice.number
+    draws = buffer.draw_index(key, (data.resample.shape[1], among), grown.size)
+    draws = draws if choice is None else sharding.pin(draws, PartitionSpec(None, sharding.ROBOTS))[:, choice.rows]
     index = buffer.append(buffer.Buffer(data.resample, data.pairs.added), draws.T, mask, overwrite=False)
     added = grown.added - data.pairs.added
     return HumanData(grown, index.rows, data.dropped + jnp.sum(mask, dtype=jnp.int32) - added, data.weight)
@@ -94,7 +112,14 @@ def weigh(before: HumanData, after: HumanData, weight: jax.Array, mask: jax.Arra
 
 
 def append_augmented(
-    data: HumanData, pairs: Pair, mask: jax.Array, key: jax.Array, *, image_shape: tuple[int, int, int], copies: int
+    data: HumanData,
+    pairs: Pair,
+    mask: jax.Array,
+    key: jax.Array,
+    choice: Choice | None = None,
+    *,
+    image_shape: tuple[int, int, int],
+    copies: int,
 ) -> HumanData:
     """Add pairs as `append` does, each in several copies whose images are augmented.
 
@@ -113,7 +138,8 @@ def append_augmented(
         same = Pair(images, jnp.broadcast_to(action, (copies, *action.shape)))
         return append(data, same, jnp.broadcast_to(wanted, copies), key_data), None
 
-    return jax.lax.scan(add, data, (pairs, mask, jax.random.split(key, mask.shape[0])))[0]
+    keys = jax.random.split(key, mask.shape[0] if choice is None else choice.number)
+    return jax.lax.scan(add, data, (pairs, mask, keys if choice is None else keys[choice.rows]))[0]
 
 
 class Learner(NamedTuple):
@@ -124,13 +150,14 @@ class Learner(NamedTuple):
         predict: `(PolicyState, obs f32[..., O]) -> (action f32[..., A], uncertainty f32[...])`; the uncertainty lies in
             [0, 1] (discrete: entropy in nats).
         update: `(PolicyState, HumanData, key) -> (PolicyState, loss f32[])`, one gradient step.
-        append: `(HumanData, Pair[K], mask bool[K], key) -> HumanData` adds pairs, in `augmented_copies` if so configured.
+        append: `(HumanData, Pair[K], mask bool[K], key, Choice | None) -> HumanData` adds pairs, in `augmented_copies` if so
+            configured.
     """
 
     init: Callable[[jax.Array, Normalizer], PolicyState]
     predict: Callable[[PolicyState, jax.Array], tuple[jax.Array, jax.Array]]
     update: Callable[[PolicyState, HumanData, jax.Array], tuple[PolicyState, jax.Array]]
-    append: Callable[[HumanData, Pair, jax.Array, jax.Array], HumanData] = append
+    append: Callable[..., HumanData] = append
 
 
 def make_learner(config: Config, spec: EnvSpec) -> Learner:

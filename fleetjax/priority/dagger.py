@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from fleetjax import sharding
 from fleetjax.field import PARAMETERS
 from fleetjax.priority.base import Algorithm, Priority, stateless
 from fleetjax.priority.ranks import above, lexicographic
@@ -32,9 +33,9 @@ def update_moments(moments: Moments, values: jax.Array) -> Moments:
     """Return the moments with `values` f32[N, 2] added (Chan's parallel formula)."""
     added = jnp.float32(values.shape[0])
     number = moments.number + added
-    mean = jnp.mean(values, axis=0)
+    mean = sharding.total(values) / added
     shift = mean - moments.mean
-    squares = moments.squares + jnp.sum((values - mean) ** 2, axis=0) + shift**2 * moments.number * added / number
+    squares = moments.squares + sharding.total((values - mean) ** 2) + shift**2 * moments.number * added / number
     return Moments(number, moments.mean + shift * added / number, squares)
 
 

@@ -28,13 +28,14 @@ def in_order(letters: str) -> Callable[[Any], Priority]:
                 "u": above(signals.uncertainty, config.uncertainty_threshold),
                 "r": above(signals.risk, config.risk_threshold),
             }
-            ranks = lexicographic(*(columns[letter] for letter in letters))
+            early = ("c" in letters) & (signals.timestep < config.initial_period)
+            waits = early & signals.violation
+            ranks = lexicographic(*(jnp.where(waits, 0.0, columns[letter].astype(jnp.float32)) for letter in letters))
             if "c" not in letters:
                 return ranks
-            early = signals.timestep < config.initial_period
-            idle = early & config.parameters["idle_humans_teleoperate"] & (ranks == 0)
+            idle = early & config.parameters["idle_humans_teleoperate"] & ~waits & (ranks == 0)
             chance = jax.random.uniform(key, ranks.shape)  # below every rank but 0
-            return jnp.where(early & signals.violation, 0.0, jnp.where(idle, chance, ranks))
+            return jnp.where(idle, chance, ranks)
 
         return stateless(score)
 

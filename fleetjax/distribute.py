@@ -1,0 +1,59 @@
+"""The state of a fleet on a mesh of devices: robots and what critics store of them are divided, all else is everywhere."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+from fleetjax import sharding
+from fleetjax.fleet import FleetState
+from fleetjax.learning.buffer import Buffer, in_parts, is_buffer
+
+
+def alone(function: Callable[[], Any]) -> Any:
+    """Return what a function without arguments returns, which every device of the mesh computes for itself."""
+    return function() if sharding.division() is None else sharding.on_each(function, sharding.EVERYWHERE)
+
+
+def spread(state: FleetState) -> FleetState:
+    """Return a state whose rings have a part for each device of the mesh, or are undivided without one."""
+    here = sharding.division()
+    return place(with_parts(state, 1 if here is None else here.mesh.size))
+
+
+def with_parts(state: FleetState, parts: int) -> FleetState:
+    """Return a state whose rings have so many parts; 1 = undivided."""
+
+    def cut(x: Any) -> Any:
+        return in_parts(x, parts) if isinstance(x, Buffer) and x.added.size != parts else x
+
+    return state._replace(estimators=_map(cut, state.estimators))
+
+
+def place(state: FleetState) -> FleetState:
+    """Return a state that is divided over the mesh."""
+    robots = (state.env, state.resetting, state.correction)
+    env, resetting, correction = sharding.pin(robots, sharding.DIVIDED)
+
+    def put(x: Any) -> Any:
+        if not isinstance(x, Buffer) or not x.added.ndim:
+            return sharding.everywhere(x)
+        return sharding.pin(x, sharding.DIVIDED)
+
+    others = (state.timestep, state.humans, state.policy, state.human_data, state.priority)
+    timestep, humans, policy, human_data, priority = sharding.everywhere(others)
+    return state._replace(
+        timestep=timestep,
+        env=env,
+        humans=humans,
+        resetting=resetting,
+        correction=correction,
+        policy=policy,
+        human_data=human_data,
+        estimators=_map(put, state.estimators),
+        priority=priority,
+    )
+
+
+def _map(function: Callable[[Any], Any], estimators: Any) -> Any:
+    return jax.tree.map(function, estimators, is_leaf=is_buffer)

@@ -1,0 +1,187 @@
+"""A fleet that is divided among devices is the same fleet. The devices are eight virtual ones; see `conftest.py`."""
+
+import re
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+import fleetjax
+from fleetjax import sharding
+from fleetjax.allocation import choose
+from fleetjax.experiment import step_once
+from fleetjax.learning import buffer
+from fleetjax.priority import lexicographic
+
+DEVICES = 8
+COLLECTIVE = re.compile(r"= (\S+|\(.*?\)) (all-reduce|all-gather|all-to-all|collective-permute|reduce-scatter)(?:-start)?\(")
+SMALL = {
+    "num_robots": 40,
+    "num_humans": 5,
+    "num_steps": 30,
+    "initial_period": 3,
+    "num_demonstrations": 100,
+    "batch_size": 32,
+    "pretraining_steps": 20,
+    "num_critic_transitions": 200,
+    "critic_pretraining_steps": 10,
+    "critic_capacity": 1003,  # which eight devices do not divide
+}
+
+
+@cache
+def mesh_of(size=DEVICES):
+    return jax.make_mesh((size,), ("any",), devices=jax.devices()[:size])
+
+
+@cache
+def small(algorithm, environment="navigation", **others):
+    return fleetjax.make_config(environment, algorithm, **SMALL | others)
+
+
+run = jax.jit(fleetjax.run, static_argnames=("mesh", "env"))
+prepare = jax.jit(fleetjax.prepare)
+
+
+def on_mesh(function, num_humans, *args):
+    """Return what a function returns that is traced for a mesh."""
+
+    def traced(*args):
+        with sharding.over(mesh_of(), num_humans):
+            return function(*args)
+
+    return jax.jit(traced)(*args)
+
+
+quick_choose = jax.jit(choose, static_argnums=2)
+quick_lexicographic = jax.jit(lexicographic)
+few_values = st.lists(st.integers(0, 3), min_size=16, max_size=16)  # so that there are many ties
+
+
+@given(few_values, st.integers(0, 100), st.sampled_from([1, 3, 16]))
+def test_devices_choose_together_whom_one_would_choose(scores, seed, number):
+    scores, key = jnp.array(scores, jnp.float32), jax.random.key(seed)
+    alone, together = quick_choose(scores, key, number), on_mesh(partial(choose, number=number), number, scores, key)
+    np.testing.assert_array_equal(alone, together)
+
+
+@given(st.lists(few_values, min_size=2, max_size=2), st.integers(0, 100), st.sampled_from([1, 3, 16]))
+def test_ranks_on_a_mesh_lead_to_the_same_choice(table, seed, number):
+    columns, key = [jnp.array(column, jnp.float32) for column in table], jax.random.key(seed)
+    ranks, divided = quick_lexicographic(*columns), on_mesh(lexicographic, number, *columns)
+    np.testing.assert_array_equal(ranks > 0, divided > 0)
+    (best, robots), (divided_best, divided_robots) = (quick_choose(scores, key, number) for scores in (ranks, divided))
+    np.testing.assert_array_equal(np.where(best > 0, robots, -1), np.where(divided_best > 0, divided_robots, -1))
+
+
+@given(st.integers(0, 60), st.sampled_from([1, 2, 8]), st.sampled_from([1, 3, 8]))
+def test_a_ring_keeps_its_rows_in_any_number_of_parts(added, before, after):
+    ring = buffer.create(jnp.zeros((), jnp.int32), 24)
+    for number in range(added):
+        ring = buffer.append(ring, jnp.array([number]), jnp.array([True]), overwrite=True)
+    ring = buffer.in_parts(buffer.in_parts(ring, before), after)
+    found = np.asarray(buffer.read(ring, jnp.arange(int(ring.size))))
+    assert sorted(found.tolist()) == list(range(max(0, added - 24), added))
+    assert ring.added.shape == ((after,) if after > 1 else ())
+
+
+def test_a_part_of_a_ring_takes_the_rows_of_its_own_robots():
+    ring = buffer.in_parts(buffer.create(jnp.zeros((), jnp.int32), 8), 2)
+    mask = jnp.array([True, False, True, True])
+    ring = buffer.append(ring, jnp.array([10, 11, 20, 21]), mask, overwrite=True)
+    assert ring.added.tolist() == [1, 2]
+    assert buffer.read(ring, jnp.arange(3)).tolist() == [10, 20, 21]
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "environment"),
+    [
+        ("random", "navigation"),
+        *(pytest.param(*pair, marks=pytest.mark.slow) for pair in [("cur", "navigation"), ("cur", "humanoid")]),
+    ],
+)
+def test_a_timestep_from_the_same_state_agrees_to_rounding(algorithm, environment):
+    config, key = small(algorithm, environment, num_steps=5, initial_period=0), jax.random.key(0)
+    state = prepare(config, key)
+    alone, divided = run(config, key, state), run(config, key, state, mesh=mesh_of())
+    for name in alone.metrics._fields:
+        # Critics on a mesh draw other batches, so it is the first timestep that must agree.
+        here, there = (np.asarray(getattr(result.metrics, name))[0] for result in (alone, divided))
+        np.testing.assert_allclose(here, there, rtol=1e-4, atol=1e-5, err_msg=name)
+    one = jax.jit(step_once, static_argnums=1)(config, fleetjax.envs.make(environment, config.backend), state, key)
+    there = run(config.replace(num_steps=1), key, state, mesh=mesh_of()).state
+    np.testing.assert_array_equal(one.humans.robot, there.humans.robot)
+    np.testing.assert_allclose(one.env.obs, there.env.obs, rtol=1e-4, atol=1e-4)
+    np.testing.assert_array_equal(one.human_data.resample, there.human_data.resample)
+    for here, elsewhere in zip(jax.tree.leaves(one.policy.params), jax.tree.leaves(there.policy.params), strict=True):
+        np.testing.assert_allclose(here, elsewhere, rtol=1e-3, atol=1e-5)
+
+
+def test_where_nothing_rounds_a_run_agrees_to_the_bit():
+    config, key = small("expert", num_humans=40), jax.random.key(1)
+    alone, divided = run(config, key), run(config, key, mesh=mesh_of())
+    for here, there in zip(jax.tree.leaves(alone.state.env), jax.tree.leaves(divided.state.env), strict=True):
+        np.testing.assert_array_equal(jax.device_get(here), jax.device_get(there))
+    for name in set(alone.metrics._fields) - {"reward", "uncertainty"}:  # sums over robots, which do round
+        np.testing.assert_array_equal(getattr(alone.metrics, name), getattr(divided.metrics, name))
+    assert not divided.state.env.obs.sharding.is_fully_replicated
+
+
+@pytest.mark.slow
+@pytest.mark.statistical
+def test_runs_agree_in_distribution():
+    config, keys = small("cur", num_steps=200), jax.random.split(jax.random.key(2), 10)
+    totals = {
+        mesh: np.array([int(run(config, key, mesh=mesh).metrics.successes.sum()) for key in keys]) for mesh in (None, mesh_of())
+    }
+    assert totals[None].std() > 0
+    assert stats.ks_2samp(totals[None], totals[mesh_of()]).pvalue > 0.001
+
+
+@pytest.mark.slow
+def test_runs_from_the_start_and_from_each_others_ends_share_one_program():
+    config, key = small("cur", num_steps=2, pretraining_steps=1, critic_pretraining_steps=1), jax.random.key(0)
+    again = jax.jit(lambda state: fleetjax.run(config, key, state, mesh=mesh_of()).state)
+    state = jax.jit(lambda: fleetjax.prepare(config, key, mesh=mesh_of()))()
+    again(again(again(state)))
+    assert again._cache_size() == 1
+
+
+def test_a_run_continues_on_another_number_of_devices():
+    config, key = small("random", num_steps=6), jax.random.key(3)
+    half = run(config, key, mesh=mesh_of()).state
+    moved = jax.device_put(half, jax.devices()[0])
+    ends = [run(config, key, half, mesh=mesh_of()).metrics, run(config, key, moved).metrics]
+    np.testing.assert_array_equal(ends[0].human_steps, ends[1].human_steps)
+    np.testing.assert_allclose(ends[0].reward, ends[1].reward, rtol=1e-4)
+
+
+def exchanged(config):
+    """Return the shape and the kind of every collective of a run's program."""
+    shapes = jax.eval_shape(fleetjax.prepare, config, jax.random.key(0))
+    text = run.lower(config, jax.random.key(0), shapes, mesh=mesh_of()).compile().as_text()
+    return sorted(COLLECTIVE.findall(text))
+
+
+@pytest.mark.parametrize("algorithm", ["random", pytest.param("cur", marks=pytest.mark.slow)])
+def test_what_devices_exchange_does_not_grow_with_the_fleet(algorithm):
+    few, many = (exchanged(small(algorithm, num_robots=n, critic_capacity=2000, human_capacity=400)) for n in (64, 128))
+    assert few == many
+    assert 0 < len(few) < 40
+
+
+def test_a_fleet_that_devices_cannot_divide_is_refused():
+    with pytest.raises(
+        ValueError, match=r"num_robots = 42 cannot be divided equally among 8 devices; use num_robots = 40 or 48"
+    ):
+        fleetjax.run(small("random", num_robots=42), jax.random.key(0), mesh=mesh_of())
+
+
+def test_the_soft_allocation_is_refused():
+    with pytest.raises(ValueError, match="allocation = 'soft' runs on one device only"):
+        fleetjax.run(small("weighted", allocation="soft"), jax.random.key(0), mesh=mesh_of())

@@ -129,10 +129,9 @@ def run(
 
     Raises:
         ValueError: if the configuration is not valid, the run cannot fit the memory, the number of robots is not a multiple of
-            that of devices, or the state does not fit the
-            configuration: it is another environment's or fleet's, its layout differs (other networks, estimators or memory
-            of the rule), or it has no room for the pairs that humans can give (`extend` makes room; where the state's
-            numbers are traced, `Metrics.dropped` counts what was lost).
+            that of devices, or the state does not fit the configuration: it is another environment's or fleet's, its layout
+            differs (other networks, estimators or memory of the rule), or it has no room for the pairs that humans can give
+            (`extend` makes room; where the state's numbers are traced, `Metrics.dropped` counts what was lost).
 
     Reference: paper, Sections 3 and 4.
     """

@@ -95,6 +95,23 @@ def test_a_run_whose_process_was_killed_ends_and_resumes_on_another_number_of_pr
 
 
 @pytest.mark.slow
+def test_a_run_whose_checkpoints_are_all_damaged_is_not_begun_again(tmp_path):
+    folder, long = tmp_path / "run", {"num_steps": 6000, "checkpoint_every": 60}
+    (process,) = start(folder, 1, 2, **long)
+    wait_for_rows(folder, 150)
+    process.send_signal(signal.SIGTERM)
+    ((code, errors),) = finish([process])
+    assert code == 130, errors
+    for manifest in folder.glob("checkpoints/*/manifest.json"):
+        manifest.write_text("{")
+    before = (folder / "metrics.csv").read_bytes()
+    ((code, errors),) = finish(start(folder, 1, 2, **long))
+    assert code == 2
+    assert "has no checkpoint that can be used; delete the folder, or choose another --output" in errors
+    assert (folder / "metrics.csv").read_bytes() == before
+
+
+@pytest.mark.slow
 def test_processes_that_differ_are_refused(tmp_path):
     port = free_port()
     started = [

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,7 @@ from fleetjax.learning.buffer import Buffer, is_buffer
 
 FOLDER, ARRAYS, MANIFEST = "checkpoints", "arrays", "manifest.json"
 KEPT = 2
+Used = TypeVar("Used")
 
 
 class Checkpoint(NamedTuple):
@@ -135,23 +136,22 @@ def write_shares(
 
 
 def newest(
-    folder: Path, identity: Mapping[str, Any], check: Callable[[Mapping[str, Any]], Any]
+    folder: Path, identity: Mapping[str, Any], check: Callable[[int, Mapping[str, Any]], Any]
 ) -> tuple[Path | None, list[str]]:
     """Return the newest checkpoint whose files are intact, or None, and for each newer one the reason why it cannot be used.
 
     Args:
         folder: folder of the run.
         identity: the run's.
-        check: raises ValueError for notes that do not fit the run's other files.
+        check: raises ValueError for a timestep and notes that do not fit the run's other files.
     """
-    refused = []
-    for path in reversed(_found(folder / FOLDER)):
-        try:
-            check(_manifest(path, identity)["notes"])
-            return path, refused
-        except ValueError as error:
-            refused.append(f"{path}: {files.one_line(error)}")
-    return None, refused
+
+    def look(path: Path) -> Path:
+        manifest = _manifest(path, identity)
+        check(manifest.get("timestep", -1), manifest["notes"])
+        return path
+
+    return _first(folder, look)
 
 
 def read_shares(
@@ -177,15 +177,7 @@ def read_shares(
         spec = PartitionSpec(mesh.axis_names[0]) if divided else PartitionSpec()
         return jax.ShapeDtypeStruct(shape, dtype, sharding=NamedSharding(mesh, spec))
 
-    found = _checkpointer(lambda orbax: orbax.restore((path / ARRAYS).absolute(), _named(wanted, struct)))
-    names, leaves = zip(*jax.tree_util.tree_leaves_with_path(wanted), strict=True)
-
-    def restored(name: str, leaf: Any) -> Any:
-        array = found[name] if leaf.size else jnp.zeros(*_layout(leaf))
-        return jax.random.wrap_key_data(array) if _is_key(leaf) else array
-
-    arrays = [restored(jax.tree_util.keystr(name), leaf) for name, leaf in zip(names, leaves, strict=True)]
-    return jax.tree.unflatten(jax.tree.structure(wanted), arrays), manifest["notes"]
+    return _load(path, wanted, struct, manifest), manifest["notes"]
 
 
 def _rings(state: FleetState) -> list[Buffer]:
@@ -224,12 +216,21 @@ def restore(
     Returns:
         The checkpoint, or None if there is none, and for each newer one the reason why it cannot be used.
     """
+
+    def read(path: Path) -> Checkpoint:
+        checkpoint = _read(path, identity, shapes)
+        check(checkpoint)
+        return checkpoint
+
+    return _first(folder, read)
+
+
+def _first(folder: Path, use: Callable[[Path], Used]) -> tuple[Used | None, list[str]]:
+    """Return what `use` makes of the newest checkpoint that it takes, or None, and for each newer one why it does not."""
     refused = []
     for path in reversed(_found(folder / FOLDER)):
         try:
-            checkpoint = _read(path, identity, shapes)
-            check(checkpoint)
-            return checkpoint, refused
+            return use(path), refused
         except Exception as error:  # whatever damage makes orbax raise, an older one may be intact
             refused.append(f"{path}: {files.one_line(error)}")
     return None, refused
@@ -242,14 +243,22 @@ def _read(path: Path, identity: Mapping[str, Any], shapes: FleetState) -> Checkp
         ValueError: if it is unfinished, damaged or belongs to another run.
     """
     manifest = _manifest(path, identity)
-    template = _named(shapes, lambda x: np.zeros(*_layout(x)))
-    found = _checkpointer(lambda orbax: orbax.restore((path / ARRAYS).absolute(), template))
+    return Checkpoint(path, _load(path, shapes, lambda x: np.zeros(*_layout(x)), manifest), manifest["notes"])
+
+
+def _load(path: Path, shapes: FleetState, target: Callable[[Any], Any], manifest: Mapping[str, Any]) -> FleetState:
+    """Return the stored state, each array like `target` of its leaf.
+
+    Raises:
+        ValueError: if it does not fit the shapes or the manifest.
+    """
+    found = _checkpointer(lambda orbax: orbax.restore((path / ARRAYS).absolute(), _named(shapes, target)))
     names, leaves = zip(*jax.tree_util.tree_leaves_with_path(shapes), strict=True)
     arrays = [_restored(found, jax.tree_util.keystr(name), leaf) for name, leaf in zip(names, leaves, strict=True)]
     state: FleetState = jax.tree.unflatten(jax.tree.structure(shapes), arrays)
     if int(state.timestep) != manifest.get("timestep"):
         raise ValueError("its timestep does not match the manifest")
-    return Checkpoint(path, state, manifest["notes"])
+    return state
 
 
 def _manifest(path: Path, identity: Mapping[str, Any]) -> dict[str, Any]:
@@ -321,7 +330,7 @@ def _named(state: FleetState, value: Callable[[Any], Any]) -> dict[str, Any]:
     return {jax.tree_util.keystr(name): value(leaf) for name, leaf in leaves if leaf.size}
 
 
-def _restored(found: Mapping[str, np.ndarray], name: str, leaf: Any) -> jax.Array:
+def _restored(found: Mapping[str, Any], name: str, leaf: Any) -> jax.Array:
     """Return the array for a leaf.
 
     Raises:
@@ -331,7 +340,7 @@ def _restored(found: Mapping[str, np.ndarray], name: str, leaf: Any) -> jax.Arra
     array = found[name] if leaf.size else np.zeros(shape, dtype)
     if (array.shape, array.dtype) != (shape, dtype):
         raise ValueError(f"{name} is {array.dtype}{list(array.shape)}, expected {dtype}{list(shape)}")
-    restored = jnp.array(array)  # a copy, whose memory a run may take over
+    restored = jnp.array(array) if isinstance(array, np.ndarray) else array  # a copy, whose memory a run may take over
     restored = jax.random.wrap_key_data(restored) if _is_key(leaf) else restored
     if restored.dtype != leaf.dtype:
         raise ValueError(f"{name} is {restored.dtype}, expected {leaf.dtype}")

@@ -162,28 +162,46 @@ def _resume(run: folder.Run) -> Start | None:
     Raises:
         Refusal: if there are checkpoints and none can be used.
     """
-    logs = {"metrics": folder.METRICS} | ({"interventions": interventions.FILE} if run.logged else {})
 
     def check(found: checkpoint.Checkpoint) -> None:
-        data = {name: files.beginning(run.folder / file, found.notes.get(name)) for name, file in logs.items()}
-        timestep = int(found.state.timestep)
-        if len(metrics_csv.parse(data["metrics"], timestep).successes) != timestep:
-            raise ValueError(f"{folder.METRICS} had fewer timesteps at that time")
+        metrics_until(run, int(found.state.timestep), found.notes)
+        if run.logged:
+            files.beginning(run.folder / interventions.FILE, found.notes.get("interventions"))
 
     shapes = state_shapes(run.config, envs.make(run.config.environment, run.config.backend))
     found, refused = checkpoint.restore(run.folder, folder.identity(run.config, run.seed), shapes, check)
     for reason in refused:
         say(f"skipped checkpoint {reason}")
     if found is None:
-        if checkpoint.is_any_finished(run.folder):
-            reason = f"{run.folder} has no checkpoint that can be used"
-            raise Refusal(f"{reason}; delete the folder, or {folder.from_the_start(run)}")
+        check_nothing_is_lost(run, folder.from_the_start(run))
         say("no checkpoint was written yet; starting from t = 0")
         return None
     say(f"resuming from {found.path}")
-    data = files.beginning(run.folder / folder.METRICS, found.notes["metrics"])
-    metrics = metrics_csv.parse(data, run.config.num_steps)
-    return Start(under_versions_of_today(run, int(found.state.timestep)), found.state, metrics, found.notes)
+    timestep = int(found.state.timestep)
+    metrics = metrics_until(run, timestep, found.notes)
+    return Start(under_versions_of_today(run, timestep), found.state, metrics, found.notes)
+
+
+def metrics_until(run: folder.Run, timestep: int, notes: Mapping[str, Any]) -> Metrics:
+    """Return Metrics[t] until the checkpoint at a timestep, by its notes.
+
+    Raises:
+        ValueError: if the file no longer holds them.
+    """
+    metrics = metrics_csv.parse(files.beginning(run.folder / folder.METRICS, notes.get("metrics")), timestep)
+    if len(metrics.successes) != timestep:
+        raise ValueError(f"{folder.METRICS} had fewer timesteps at that time")
+    return metrics
+
+
+def check_nothing_is_lost(run: folder.Run, remedy: str) -> None:
+    """Check that a run of which no checkpoint can be used has none, so that it may start again.
+
+    Raises:
+        Refusal: if there are checkpoints, with what to do besides deleting the folder.
+    """
+    if checkpoint.is_any_finished(run.folder):
+        raise Refusal(f"{run.folder} has no checkpoint that can be used; delete the folder, or {remedy}")
 
 
 def under_versions_of_today(run: folder.Run, timestep: int) -> folder.Run:

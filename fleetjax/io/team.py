@@ -208,8 +208,9 @@ class _Signs:
             return 0  # which holds the store
         now = time.monotonic()
         for process, (sign, _) in self._heard.items():
-            if signs.get(str(process), -1) != sign:
-                self._heard[process] = (signs[str(process)], now)
+            found = signs.get(str(process), -1)
+            if found != sign:
+                self._heard[process] = (found, now)
         silent = [process for process, (_, when) in self._heard.items() if now - when > SILENCE]
         return silent[0] if silent else None
 

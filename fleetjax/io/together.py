@@ -13,7 +13,7 @@ from fleetjax.checks import state_shapes
 from fleetjax.distribute import spread, with_parts
 from fleetjax.experiment import prepare
 from fleetjax.fleet import FleetState
-from fleetjax.io import checkpoint, chunks, files, folder, metrics_csv, resumable, team, text
+from fleetjax.io import checkpoint, chunks, files, folder, resumable, team, text
 from fleetjax.io.errors import Diverged, Refusal
 from fleetjax.io.journal import Journal
 from fleetjax.io.progress import progress, say
@@ -61,15 +61,13 @@ def _look(run: folder.Run, stack: contextlib.ExitStack) -> dict[str, Any]:
         return {"finished": False, "checkpoint": None}
     if folder.read_finished(resumable.read_same(run)):
         return {"finished": True}
-    path, refused = checkpoint.newest(run.folder, folder.identity(run.config, run.seed), lambda notes: _metrics(run, notes))
+    fits = partial(resumable.metrics_until, run)
+    path, refused = checkpoint.newest(run.folder, folder.identity(run.config, run.seed), fits)
     for reason in refused:
         say(f"skipped checkpoint {reason}")
+    if path is None:
+        resumable.check_nothing_is_lost(run, "choose another --output")
     return {"finished": False, "checkpoint": path and path.name}
-
-
-def _metrics(run: folder.Run, notes: Mapping[str, Any]) -> Metrics:
-    """Return Metrics[t] until a checkpoint, by its notes."""
-    return metrics_csv.parse(files.beginning(run.folder / folder.METRICS, notes.get("metrics")), run.config.num_steps)
 
 
 def _start(run: folder.Run, name: str | None, mesh: Mesh) -> tuple[FleetState, Metrics | None, Mapping[str, Any]]:
@@ -86,7 +84,8 @@ def _start(run: folder.Run, name: str | None, mesh: Mesh) -> tuple[FleetState, M
         with sharding.over(mesh, config.num_humans):
             return spread(state)
 
-    return jax.jit(divide)(state), _metrics(run, notes) if team.leads() else None, notes
+    before = resumable.metrics_until(run, int(state.timestep), notes) if team.leads() else None
+    return jax.jit(divide)(state), before, notes
 
 
 def _run(run: folder.Run, begun: dict[str, Any], every: int, beat: Callable[[], None], again: str) -> Metrics | None:

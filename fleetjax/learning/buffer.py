@@ -96,9 +96,8 @@ def in_parts(ring: Buffer, parts: int) -> Buffer:
     """
     before = max(ring.added.size, 1)
     room, each = ring.capacity // before, -(-ring.capacity // parts)
-    number = (
-        jnp.arange(each) * parts + jnp.arange(parts)[:, None]
-    )  # of the row in each place, in the order in which they are dealt
+    # The number of the row in each place, in the order in which they are dealt.
+    number = jnp.arange(each) * parts + jnp.arange(parts)[:, None]
     added = ring.added.reshape(-1)
     ends = jnp.cumsum(ring.sizes.reshape(-1))
     part = jnp.minimum(jnp.searchsorted(ends, number.reshape(-1), side="right"), before - 1)

@@ -111,6 +111,22 @@ def test_a_run_whose_checkpoints_are_all_damaged_is_not_begun_again(tmp_path):
     assert (folder / "metrics.csv").read_bytes() == before
 
 
+@pytest.mark.parametrize("later", [0, 1])
+def test_processes_may_end_at_different_times(later):
+    program = f"""
+import sys, time
+from fleetjax.io import team
+process = int(sys.argv[1])
+team.join(team.Meeting("localhost:{free_port()}", 2, process, 120))
+team.meet("here")
+time.sleep(3 if process == {later} else 0)
+"""
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    started = [subprocess.Popen([sys.executable, "-c", program, process], **pipes) for process in "01"]
+    for code, errors in finish(started):
+        assert code == 0, errors
+
+
 @pytest.mark.slow
 def test_processes_that_differ_are_refused(tmp_path):
     port = free_port()

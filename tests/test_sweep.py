@@ -19,6 +19,7 @@ from fleetjax import cli
 from fleetjax.io import crew, flags, folder, resumable, study, sweep
 
 STEPS = 2000
+LONG = 5 * STEPS
 TINY = [
     *("--num-robots", "2", "--num-humans", "2", "--num-steps", str(STEPS), "--hard-reset-time", "2"),
     *("--hidden-sizes", "8", "--ensemble-size", "2", "--batch-size", "8", "--critic-capacity", "300"),
@@ -310,7 +311,7 @@ def whole(tmp_path_factory, compiled):
 @pytest.fixture(scope="module")
 def whole_long(tmp_path_factory, compiled):
     """The same of runs that are too long to end before a signal arrives."""
-    return plain_runs(tmp_path_factory.mktemp("long"), compiled, 10 * STEPS)
+    return plain_runs(tmp_path_factory.mktemp("long"), compiled, LONG)
 
 
 def plain_runs(path: Path, compiled: list[float], steps: int) -> dict[int, list[bytes]]:
@@ -520,22 +521,22 @@ def test_a_launcher_needs_submitit(capsys, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_jobs_of_a_cluster_take_over_what_dead_ones_leave(tmp_path, spawn, whole):
+def test_jobs_of_a_cluster_take_over_what_dead_ones_leave(tmp_path, spawn, whole_long):
     output = tmp_path / "out"
+    steps = LONG
     jobs = ("--launcher", "local", "--jobs", 4, "--lease", 3)
-    process = spawn("sweep", "navigation", *RANDOM, "--seeds", 6, *jobs, "--output", output)
+    process = spawn("sweep", "navigation", *RANDOM, "--num-steps", steps, "--seeds", 6, *jobs, "--output", output)
     with contextlib.ExitStack() as stack:
         stack.callback(process.kill)
         killed = []
         for victim in (0, 1):
             wait_until(lambda victim=victim: rows(the_run(output, victim)) > 200, process)
-            if rows(the_run(output, victim)) < STEPS:
-                killed.append(owner(the_run(output, victim)))
-                os.kill(killed[-1], signal.SIGKILL)
+            killed.append(owner(the_run(output, victim)))
+            os.kill(killed[-1], signal.SIGKILL)
         code, _, said = end(process)
     assert code == 0, said
     assert len(set(killed)) == 2
-    assert [results(the_run(output, seed)) for seed in range(3)] == [whole[seed] for seed in range(3)]
+    assert [results(the_run(output, seed)) for seed in range(3)] == [whole_long[seed] for seed in range(3)]
     for seed in range(6):
         leases = sorted((output / "leases" / f"navigation-random-seed{seed}").iterdir())
         ends = [json.loads(path.read_text())["end"] for path in leases]
@@ -571,7 +572,7 @@ def test_ctrl_c_while_a_process_starts_reaches_its_parent_alone():
     ],
 )
 def test_a_stopped_sweep_writes_checkpoints_and_resumes(tmp_path, spawn, whole_long, options, stop):
-    output, steps = tmp_path / "out", 10 * STEPS
+    output, steps = tmp_path / "out", LONG
     command = ("sweep", "navigation", *RANDOM, "--num-steps", steps, "--seeds", 3, *options, "--checkpoint-every", 0)
     command += ("--output", output)
     process = spawn(*command)

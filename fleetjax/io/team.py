@@ -4,6 +4,7 @@ JAX's coordination service connects them, gloo carries what CPU devices exchange
 folder, but for checkpoints, of which each process writes its share.
 """
 
+import atexit
 import contextlib
 import json
 import os
@@ -26,6 +27,7 @@ from fleetjax.io.errors import Refusal
 LARGEST = 2**16  # bytes that processes tell each other at once
 INTERVAL = 2.0  # seconds between two signs of life
 SILENCE = 30.0  # seconds without a sign after which a process is gone
+LEAVING = 20.0  # seconds that process 0 waits at its end for the others to leave
 
 
 class Meeting(NamedTuple):
@@ -74,6 +76,20 @@ def join(meeting: Meeting) -> None:
             jax.distributed.initialize(*given, initialization_timeout=meeting.timeout + 60, shutdown_timeout_seconds=10)
         except Exception as error:  # of many kinds, by what is missing
             raise Refusal(f"{message} ({files.one_line(error)})") from error
+    if leads():
+        atexit.register(_leave_last)  # before JAX's own end, which was registered first
+
+
+def _leave_last() -> None:
+    """Wait until the other processes have left. This one holds what connects them: without it JAX aborts them as they leave."""
+    others_leave = threading.Thread(target=_wait_for_the_others, daemon=True)
+    others_leave.start()
+    others_leave.join(LEAVING)
+
+
+def _wait_for_the_others() -> None:
+    with contextlib.suppress(jax.errors.JaxRuntimeError):
+        distributed.global_state.client.get_live_nodes(list(range(jax.process_count())))  # answers as soon as they do, or left
 
 
 def _knock(host: str, port: int, timeout: int) -> None:

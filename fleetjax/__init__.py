@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from fleetjax.io.comparing import compare
     from fleetjax.io.comparison import Comparison
     from fleetjax.io.figure import plot
-    from fleetjax.learning.estimators import Estimator, Step, register_estimator
+    from fleetjax.learning.estimator import Estimator, Step
+    from fleetjax.learning.estimators import register_estimator
     from fleetjax.metrics import Metrics, first_divergence, rohe
     from fleetjax.priority import Algorithm, Priority, list_algorithms, register_algorithm, register_priority
     from fleetjax.supervisors import Supervisor, list_supervisors, register_supervisor
@@ -94,7 +95,8 @@ _NAMES = {
     "io.comparing": ["compare"],
     "io.comparison": ["Comparison"],
     "io.figure": ["plot"],
-    "learning.estimators": ["Estimator", "Step", "register_estimator"],
+    "learning.estimator": ["Estimator", "Step"],
+    "learning.estimators": ["register_estimator"],
     "metrics": ["Metrics", "first_divergence", "rohe"],
     "priority": ["Algorithm", "Priority", "list_algorithms", "register_algorithm", "register_priority"],
     "supervisors": ["Supervisor", "list_supervisors", "register_supervisor"],

@@ -8,6 +8,7 @@ import jax
 from fleetjax import sharding
 from fleetjax.fleet import FleetState
 from fleetjax.learning.buffer import Buffer, in_parts, is_buffer
+from fleetjax.priority import PerRobot
 
 
 def alone(function: Callable[[], Any]) -> Any:
@@ -40,8 +41,11 @@ def place(state: FleetState) -> FleetState:
             return sharding.everywhere(x)
         return sharding.pin(x, sharding.DIVIDED)
 
-    others = (state.timestep, state.humans, state.policy, state.human_data, state.priority)
-    timestep, humans, policy, human_data, priority = sharding.everywhere(others)
+    def put_memory(x: Any) -> Any:
+        return sharding.pin(x, sharding.DIVIDED) if isinstance(x, PerRobot) else sharding.everywhere(x)
+
+    others = (state.timestep, state.humans, state.policy, state.human_data)
+    timestep, humans, policy, human_data = sharding.everywhere(others)
     return state._replace(
         timestep=timestep,
         env=env,
@@ -51,7 +55,7 @@ def place(state: FleetState) -> FleetState:
         policy=policy,
         human_data=human_data,
         estimators=_map(put, state.estimators),
-        priority=priority,
+        priority=jax.tree.map(put_memory, state.priority, is_leaf=lambda x: isinstance(x, PerRobot)),
     )
 
 

@@ -127,6 +127,8 @@ _IDLE = Field(
     "in the initial period, humans whom nobody else needs teleoperate random robots", kind=bool, high=None, default=False
 )
 
+_TAU = Field("mean squared difference of actions above which they are a discrepancy", default=0.0025)
+
 # The parameters that an algorithm has besides, by its name. `register_algorithm` adds those of others.
 PARAMETERS: dict[str, Mapping[str, Field]] = {
     "random": {"random_threshold": Field("scores below this become 0", high=1, default=0.9)},
@@ -140,6 +142,52 @@ PARAMETERS: dict[str, Mapping[str, Field]] = {
         "risk_weight": Field("weight of the risk, in units of its threshold", default=1.0),
         "goal_weight": Field("weight of the chance not to reach the goal; needs an environment with goals", default=0.0),
     },
+    "quantile_ensemble": {
+        "quantile_rate": Field("share of robots at each timestep that may ask", high=1, default=0.01),
+        "quantile_memory": Field("time within which quantiles forget", "timesteps", low=1, default=1000.0),
+        "quantile_calibration": Field("time from which the quantile stays as it is; 0 = never", "timesteps", default=0.0),
+    },
+    "thrifty_quantile": {
+        "thrifty_rate": Field("share of robots at each timestep that may ask, by each of two criteria", high=1, default=0.01),
+        "thrifty_memory": Field("time within which quantiles and means forget", "timesteps", low=1, default=1000.0),
+    },
+    "safe_dagger": {
+        "safe_threshold": Field("chance of a discrepancy below which no robot asks", high=1, default=0.5),
+        "discrepancy_tau": _TAU,
+    },
+    "lazy_dagger": {
+        "lazy_threshold": Field("chance of a discrepancy below which no robot asks", high=1, default=0.5),
+        "discrepancy_tau": _TAU,
+        "lazy_handback": Field("discrepancy at which a human hands back, as a share of discrepancy_tau", default=0.25),
+    },
+    "dropout_dagger": {
+        "dropout_threshold": Field("share of good samples at or above which no robot asks", high=1, default=0.5),
+        "dropout_tau": Field("mean squared difference of actions up to which a sample is good", default=0.05),
+    },
+    "oracle_discrepancy": {
+        "oracle_threshold": Field("mean squared difference of actions below which no robot asks", default=0.05),
+    },
+    "crsail": {
+        "crsail_threshold": Field(
+            "distance to what humans saw, in units of the radius, below which no robot asks", default=1.0
+        ),
+        "crsail_rate": Field("share of demonstrated states beyond the radius", high=1, default=0.05),
+    },
+    "conformal": {
+        "conformal_threshold": Field("width of the interval below which no robot asks", default=0.5),
+        "conformal_rate": Field("share of humans' actions that may lie outside the interval", high=1, default=0.1),
+        "conformal_gain": Field("how fast the interval adapts", default=0.05),
+    },
+    "aim": {"aim_rate": Field("share of robots at each timestep that may ask", high=1, default=0.05)},
+    "iifl": {"iifl_rate": Field("share of robots at each timestep that may ask", high=1, default=0.001)},
+    "round_robin": {
+        "round_robin_threshold": Field("time without help up to which no robot is served", "timesteps", default=0.0),
+    },
+    "whittle": {
+        "whittle_threshold": Field("index, as worth of a timestep of help, at or below which no robot is helped", default=0.1),
+        "whittle_discount": Field("what the next timestep counts", high=0.9999, default=0.99),
+    },
+    "asa": {"asa_threshold": Field("gain in coverage below which nobody else is helped", default=0.351)},
     **{letters: {"idle_humans_teleoperate": _IDLE} for letters in ORDERS_WITH_C},
 }
 

@@ -20,7 +20,8 @@ from fleetjax.envs import Env
 from fleetjax.keys import Keys, split_keys
 from fleetjax.learning import buffer, imitation
 from fleetjax.learning.critic import CriticState
-from fleetjax.learning.estimators import ESTIMATORS, Estimator, Step
+from fleetjax.learning.estimator import Estimator, Step
+from fleetjax.learning.estimators import ESTIMATORS
 from fleetjax.learning.imitation import HumanData, Learner, Pair, PolicyState
 from fleetjax.metrics import Metrics
 from fleetjax.precision import in_32_bits

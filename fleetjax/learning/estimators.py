@@ -1,56 +1,17 @@
-"""Numbers that are learnt for each robot while the fleet runs, for rules to look at: risk, chance of the goal, and others."""
+"""Estimators by name, and those of the paper: risk and chance of the goal, by critics."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
 
 import jax
 
 from fleetjax.config import Config
 from fleetjax.envs import Env
-from fleetjax.learning import critic, pretraining
+from fleetjax.learning import critic, help, novelty, pretraining
+from fleetjax.learning.estimator import Estimator, Step
 from fleetjax.learning.imitation import HumanData, Learner, PolicyState
 from fleetjax.registry import Registry
 from fleetjax.supervisors import Supervisor
 from fleetjax.types import EnvState
-
-
-class Step(NamedTuple):
-    """One step of every robot; every array has a leading axis N.
-
-    Attributes:
-        obs: f32[O] before the step.
-        action: f32[A] what was done.
-        next_obs: f32[O] after it, before any reset or new goal.
-        violation: bool[] whether it led to a violation.
-        success: bool[] whether it completed the task.
-        robot_action: f32[A] what the robot's policy would have done.
-        given: bool[] whether a human did it.
-    """
-
-    obs: jax.Array
-    action: jax.Array
-    next_obs: jax.Array
-    violation: jax.Array
-    success: jax.Array
-    robot_action: jax.Array
-    given: jax.Array
-
-
-class Estimator(NamedTuple):
-    """Pure functions of one number that is learnt.
-
-    Attributes:
-        init: `(key, HumanData, PolicyState) -> state`, at t = 0, pre-trained if it needs that.
-        value: `(state, PolicyState, obs f32[N, O], robot_action f32[N, A]) -> f32[N]`.
-        append: `(state, Step[N], moving bool[N]) -> state` takes in the steps of the robots that moved.
-        update: `(state, PolicyState, HumanData, key) -> state`, one gradient step.
-    """
-
-    init: Callable[[jax.Array, HumanData, PolicyState], Any]
-    value: Callable[[Any, PolicyState, jax.Array, jax.Array], jax.Array]
-    append: Callable[[Any, Step, jax.Array], Any]
-    update: Callable[[Any, PolicyState, HumanData, jax.Array], Any]
-
 
 ESTIMATORS: Registry[Callable[[Config, Env, Learner, Supervisor], Estimator]] = Registry("estimator")
 
@@ -107,5 +68,13 @@ def _of_critic(kind: str) -> Callable[[Config, Env, Learner, Supervisor], Estima
     return make
 
 
-for _kind in ("safety", "goal"):
-    register_estimator(_kind, _of_critic(_kind))
+_SHIPPED = {
+    "safety": _of_critic("safety"),
+    "goal": _of_critic("goal"),
+    "discrepancy": help.make_discrepancy,
+    "intervention": help.make_intervention,
+    "divergence": help.make_divergence,
+    "novelty": novelty.make_novelty,
+}
+for _name, _make in _SHIPPED.items():
+    register_estimator(_name, _make)

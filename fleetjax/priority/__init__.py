@@ -14,6 +14,7 @@ A rule is a `Priority`: two pure functions. A new one is about ten lines:
 from fleetjax.priority.base import (
     ALGORITHMS,
     Algorithm,
+    PerRobot,
     Priority,
     estimators_of,
     get_algorithm,
@@ -23,14 +24,21 @@ from fleetjax.priority.base import (
     stateless,
 )
 from fleetjax.priority.baselines import BASELINES
+from fleetjax.priority.coverage import COVERAGE
 from fleetjax.priority.dagger import DAGGERS
+from fleetjax.priority.discrepancy import DISCREPANCIES
+from fleetjax.priority.learnt import LEARNT
 from fleetjax.priority.orders import RULES
+from fleetjax.priority.quantile import QUANTILES
+from fleetjax.priority.queues import QUEUES
 from fleetjax.priority.ranks import above, lexicographic, softly_above
 from fleetjax.priority.weighted import WEIGHTED
+from fleetjax.priority.whittle import WHITTLE
 
 __all__ = [
     "ALGORITHMS",
     "Algorithm",
+    "PerRobot",
     "Priority",
     "above",
     "estimators_of",
@@ -43,5 +51,6 @@ __all__ = [
     "stateless",
 ]
 
-for _name, _algorithm in {**BASELINES, **DAGGERS, **WEIGHTED, **RULES}.items():
+_GATES = {**QUANTILES, **DISCREPANCIES, **LEARNT, **QUEUES, **WHITTLE, **COVERAGE}
+for _name, _algorithm in {**BASELINES, **DAGGERS, **_GATES, **WEIGHTED, **RULES}.items():
     register_algorithm(_name, _algorithm)

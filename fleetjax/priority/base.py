@@ -24,6 +24,18 @@ class Priority(NamedTuple):
     score: Callable[[Signals, Any, jax.Array], tuple[jax.Array, Any]]
 
 
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class PerRobot:
+    """A part of a rule's memory with a row for each robot: on a mesh of devices each device holds those of its own.
+
+    Attributes:
+        values: pytree of arrays [N, ...].
+    """
+
+    values: Any
+
+
 def stateless(score: Callable[[Signals, jax.Array], jax.Array]) -> Priority:
     """Return the rule that scores by `(Signals[N], key) -> f32[N]` and remembers nothing."""
     return Priority(init=lambda: (), score=lambda signals, aux, key: (score(signals, key), aux))

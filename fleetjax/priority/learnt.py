@@ -1,0 +1,110 @@
+"""Gates by a learnt number: distance to what humans have seen, an adaptive interval, a critic of interventions, energies."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from fleetjax import sharding
+from fleetjax.field import PARAMETERS
+from fleetjax.priority.base import Algorithm, PerRobot, Priority, stateless
+from fleetjax.priority.gates import gated, known, teleoperated
+from fleetjax.priority.quantiles import add, empty, on_their_own, quantile
+from fleetjax.priority.ranks import above
+
+MEMORY = 1000.0  # timesteps within which quantiles forget
+NARROWEST = 1e-3  # spread of an ensemble that agrees
+
+
+def crsail(config) -> Priority:
+    """Ask if d_K / r >= `crsail_threshold`, for the distance d_K to the K-th nearest state in which humans acted.
+
+    The radius r is the quantile at level 1 - `crsail_rate` of the same distance among the demonstrated states, calibrated
+    once, before the fleet starts. See the estimator `"novelty"`.
+
+    Reference: CRSAIL, 2025 (arXiv 2512.00453: K = 5); reimplemented from the text.
+    """
+    threshold = config.parameters["crsail_threshold"]
+    return stateless(lambda signals, key: gated(signals, above(known(signals.estimates["novelty"]), threshold)))
+
+
+class Interval(NamedTuple):
+    """What `conformal` remembers: the interval's half width f32[] in units of the spread, and the last spread of each robot."""
+
+    half: jax.Array
+    spread: PerRobot
+
+
+def conformal(config) -> Priority:
+    """Ask if the interval of the human's action is wider than `conformal_threshold`: 2 q s, with the ensemble's spread s.
+
+    Only labels move q. After a timestep in which humans taught robots, q is multiplied by exp(`conformal_gain` (e -
+    `conformal_rate`)), where e is the share of these robots whose residual was beyond q s. The weight 1 / p of a label, for
+    its probability p, is the same for all of them: so e is a mean over them.
+
+    Reference: ConformalDAgger with intermittent quantile tracking, 2024 (arXiv 2410.08852); reimplemented from the text. The
+    original has one robot; the spread tells those of a fleet apart, and steps are in proportion to q.
+    """
+    own = config.parameters
+
+    def init():
+        return Interval(jnp.ones(()), PerRobot(jnp.ones(config.num_robots)))
+
+    def score(signals, past, key):
+        del key
+        taught = teleoperated(signals)
+        missed = taught & (jnp.sqrt(signals.correction) > past.half * past.spread.values)
+        number, misses = (sharding.total(flags.astype(jnp.float32)) for flags in (taught, missed))
+        change = jnp.where(number > 0, misses / jnp.maximum(number, 1.0) - own["conformal_rate"], 0.0)
+        half = jnp.clip(past.half * jnp.exp(own["conformal_gain"] * change), 1e-6, 1e6)
+        spread = jnp.sqrt(known(signals.uncertainty)) + NARROWEST
+        score = gated(signals, above(2.0 * half * spread, own["conformal_threshold"]))
+        return score, Interval(half, PerRobot(spread))
+
+    return Priority(init, score)
+
+
+def aim(config) -> Priority:
+    """Ask if the proxy value of the robot's action is above its running quantile at level 1 - `aim_rate`.
+
+    The value is learnt to be -1 for humans' actions and +1 for those of robots that humans would correct, and spreads to
+    the states before by temporal differences. See the estimator `"intervention"`.
+
+    Reference: Adaptive Intervention Mechanism (AIM), 2025; reimplemented from the text (delta = 0.05).
+    """
+    rate = config.parameters["aim_rate"]
+
+    def score(signals, past, key):
+        del key
+        value = jnp.maximum(known(signals.estimates["intervention"]) + 1.0, 0.0)
+        past = add(past, value, on_their_own(signals), jnp.float32(MEMORY))
+        return gated(signals, jnp.where(value > quantile(past, 1.0 - rate), value, 0.0)), past
+
+    return Priority(empty, score)
+
+
+def iifl(config) -> Priority:
+    """Ask if the Jeffreys divergence of two energy models is above its running quantile at level 1 - `iifl_rate`.
+
+    Here only this uncertainty comes from energy models: the robots go on to act by the regression ensemble. See the
+    estimator `"divergence"`.
+
+    Reference: Datta et al., IIFL, 2023 (Section 4, and the published code: the 99.9th percentile of the last 1 000 steps).
+    """
+    rate = config.parameters["iifl_rate"]
+
+    def score(signals, past, key):
+        del key
+        value = known(signals.estimates["divergence"])
+        past = add(past, value, on_their_own(signals), jnp.float32(MEMORY))
+        return gated(signals, jnp.where(value > quantile(past, 1.0 - rate), value, 0.0)), past
+
+    return Priority(empty, score)
+
+
+LEARNT: dict[str, Algorithm] = {
+    "crsail": Algorithm(crsail, estimators=("novelty",), parameters=PARAMETERS["crsail"]),
+    "conformal": Algorithm(conformal, parameters=PARAMETERS["conformal"]),
+    "aim": Algorithm(aim, estimators=("intervention",), parameters=PARAMETERS["aim"]),
+    "iifl": Algorithm(iifl, estimators=("divergence",), parameters=PARAMETERS["iifl"]),
+}

@@ -1,0 +1,93 @@
+"""Gates at a rate: ThriftyDAgger's own switching rule, and the ensemble's uncertainty above its running quantile."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from fleetjax.field import PARAMETERS
+from fleetjax.priority.base import Algorithm, Priority
+from fleetjax.priority.gates import gated, known, teleoperated
+from fleetjax.priority.quantiles import Histogram, add, empty, on_their_own, quantile
+
+
+def quantile_ensemble(config) -> Priority:
+    """U > q, the running quantile of U at level 1 - `quantile_rate`, over robots that move on their own.
+
+    The quantile forgets within `quantile_memory` timesteps. With `quantile_calibration` = t > 0 it stays as it is from
+    timestep t on; with 0 it is always refitted.
+
+    Reference: EnsembleDAgger (Menda et al. 2019) thresholds the variance; the quantile in its place is that of ThriftyDAgger.
+    """
+    own = config.parameters
+
+    def score(signals, past, key):
+        del key
+        values = known(signals.uncertainty)
+        fitted = add(past, values, on_their_own(signals), own["quantile_memory"])
+        until = own["quantile_calibration"]
+        frozen = (until > 0) & (signals.timestep.astype(jnp.float32) >= until)
+        past = jax.tree.map(lambda old, new: jnp.where(frozen, old, new), past, fitted)
+        bound = quantile(past, 1.0 - own["quantile_rate"])
+        return gated(signals, jnp.where(values > bound, values, 0.0)), past
+
+    return Priority(empty, score)
+
+
+class Past(NamedTuple):
+    """What `thrifty_quantile` remembers.
+
+    Attributes:
+        doubt: Histogram of uncertainties.
+        chance: Histogram of chances of success.
+        corrections: f32[2], number and sum of the corrections so far; older ones count less.
+    """
+
+    doubt: Histogram
+    chance: Histogram
+    corrections: jax.Array
+
+
+def thrifty_quantile(config) -> Priority:
+    """Ask if U > q_U(1 - a) or G < q_G(a), with a = `thrifty_rate`; hand back if |a_r - a_h|^2 < its mean and G > q_G(1/2).
+
+    q are running quantiles over robots that move on their own, and the mean is that of all corrections. They forget within
+    `thrifty_memory` timesteps, where the original refits them after each episode. G is the goal critic's chance of success;
+    where the environment has no goals, 1 - R. Robots that ask are ordered by max(U / q_U, q_G / G).
+
+    Reference: Hoque et al., ThriftyDAgger, 2021 (Section 4, and the published code: a = 0.01). Its start values 0.48 and
+    0.495 are not used: the first timestep gives the first quantiles.
+    """
+    rate, memory = config.parameters["thrifty_rate"], config.parameters["thrifty_memory"]
+
+    def init():
+        return Past(empty(), empty(), jnp.zeros(2))
+
+    def score(signals, past, key):
+        del key
+        has_goal = "goal" in (signals.estimates or {})
+        doubt, chance = known(signals.uncertainty), known(signals.goal if has_goal else 1.0 - signals.risk)
+        alone, taught = on_their_own(signals), teleoperated(signals)
+        corrections = jnp.stack([jnp.sum(taught).astype(jnp.float32), jnp.sum(jnp.where(taught, signals.correction, 0.0))])
+        past = Past(
+            add(past.doubt, doubt, alone, memory),
+            add(past.chance, chance, alone, memory),
+            past.corrections * jnp.exp(-1.0 / memory) + corrections,
+        )
+        most, least = quantile(past.doubt, 1.0 - rate), quantile(past.chance, rate)
+        asks = (doubt > most) | (chance < least)
+        urgency = jnp.maximum(doubt / jnp.maximum(most, 1e-6), least / jnp.maximum(chance, 1e-6))
+        number, total = past.corrections
+        agrees = signals.correction * number < total
+        keeps = taught & ~(agrees & (chance > quantile(past.chance, 0.5)))
+        return gated(signals, jnp.where(asks, urgency, 0.0), keeps), past
+
+    return Priority(init, score)
+
+
+QUANTILES: dict[str, Algorithm] = {
+    "quantile_ensemble": Algorithm(quantile_ensemble, parameters=PARAMETERS["quantile_ensemble"]),
+    "thrifty_quantile": Algorithm(
+        thrifty_quantile, estimators=("safety", "goal"), optional=("goal",), parameters=PARAMETERS["thrifty_quantile"]
+    ),
+}

@@ -12,6 +12,7 @@ import fleetjax
 from fleetjax import HumanState, Signals, envs, priority, supervisors
 from fleetjax.allocation import allocate
 from fleetjax.config import get_value
+from fleetjax.learning.estimators import ESTIMATORS
 from fleetjax.physics.base import PhysicsState
 
 NUM_ROBOTS = 8
@@ -242,9 +243,25 @@ def test_supervisor_gives_actions(name):
 
 def make_signals(key: jax.Array) -> Signals:
     """Return plausible signals of 24 robots, of which some are sure, safe, or in violation."""
-    keys = jax.random.split(key, 5)
+    keys = jax.random.split(key, 9)
     draws = [jnp.maximum(jax.random.uniform(k, (24,), minval=-0.5), 0.0) for k in keys[:3]]
-    return Signals(jax.random.bernoulli(keys[3], 0.3, (24,)), draws[0], draws[1], draws[2], jnp.int32(40))
+    violation, helped = (jax.random.bernoulli(k, 0.3, (24,)) for k in keys[3:5])
+    estimates = {name: jax.random.uniform(keys[5], (24,)) for name in ESTIMATORS.names()}
+    return Signals(
+        violation=violation,
+        uncertainty=draws[0],
+        risk=draws[1],
+        goal=draws[2],
+        timestep=jnp.int32(40),
+        estimates=estimates,
+        obs=jax.random.normal(keys[6], (24, 8)),
+        robot_action=jax.random.uniform(keys[7], (24, 2), minval=-1.0),
+        helped=helped,
+        help_time=helped.astype(jnp.int32),
+        correction=jnp.where(helped & ~violation, draws[0], 0.0),
+        human_action=jax.random.uniform(keys[8], (24, 2), minval=-1.0),
+        link=jnp.ones(24, jnp.float32),
+    )
 
 
 def decide(name, config, signals, aux, key):
@@ -263,7 +280,7 @@ def settings_of(name):
     """Return settings in which every rule helps somebody."""
     lower = {"random_threshold": 0.4, "thrifty_threshold": 0.5}
     own = priority.get_algorithm(name).parameters
-    config = fleetjax.make_config("navigation", initial_period=50)
+    config = fleetjax.make_config("navigation", initial_period=50, num_robots=24, num_humans=6)
     return config.replace(algorithm=name, **{field: value for field, value in lower.items() if field in own})
 
 

@@ -8,7 +8,7 @@ from fleetjax.config import Config
 from fleetjax.metrics import Metrics, rohe
 from fleetjax.priority import get_algorithm
 
-# What the paper calls an algorithm, and what it does.
+# What papers call an algorithm, and what it does.
 _KNOWN = {
     "constraint": (
         "Constraint",
@@ -24,6 +24,26 @@ _KNOWN = {
         "Fleet-ThriftyDAgger",
         "robots that are uncertain or unlikely to reach their goal first, then robots in violation",
     ),
+    "thrifty_quantile": (
+        "ThriftyDAgger",
+        "robots whose uncertainty or chance of failure is above its running quantile; humans hand back once they agree",
+    ),
+    "quantile_ensemble": ("Quantile ensemble", "robots whose uncertainty is above its running quantile"),
+    "safe_dagger": ("SafeDAgger", "robots where a classifier expects that a human would act otherwise"),
+    "lazy_dagger": ("LazyDAgger", "as safe_dagger; humans hand back only once they agree with the robot"),
+    "dropout_dagger": (
+        "DropoutDAgger",
+        "robots few of whose sampled actions are near the human's; sees the human's action first",
+    ),
+    "oracle_discrepancy": ("Oracle", "robots farthest from what the human would do, which it sees: a ceiling, not a rule"),
+    "crsail": ("CRSAIL", "robots far from all states in which humans acted"),
+    "conformal": ("ConformalDAgger", "robots with a wide conformal interval of the human's action"),
+    "aim": ("AIM", "robots that a learnt proxy value says humans would correct"),
+    "iifl": ("IIFL", "robots about whose action two energy models disagree"),
+    "round_robin": ("Round robin", "one robot after the other"),
+    "longest_waiting": ("Longest waiting", "robots in violation, first come, first served"),
+    "whittle": ("Whittle", "robots in the states in which help is worth most, by the index of a three-state chain"),
+    "asa": ("ASA", "robots in violation, uncertain or at risk that stand for many others like them: submodular allocation"),
     "expert": ("Expert", "every robot is teleoperated and nothing is learnt: an upper bound on successes"),
     "weighted": (
         "Weighted sum",
@@ -40,7 +60,7 @@ def is_order(algorithm: str) -> bool:
 
 
 def label(algorithm: str) -> str:
-    """Return the name that the paper gives an algorithm.
+    """Return the name that papers give an algorithm.
 
     >>> label("cur"), label("uc"), label("expert"), label("my_rule")
     ('C.U.R.', 'U.C.', 'Expert', 'my_rule')

@@ -33,7 +33,7 @@ def _begin(params: Any) -> Trained:
     return Trained(params, ADAM.init(params))
 
 
-def _descend(trained: Trained, loss: Any, learning_rate: jax.Array) -> Trained:
+def _descend(trained: Trained, loss: Any, learning_rate: jax.Array | float) -> Trained:
     return Trained(*descend(trained.params, jax.grad(loss)(trained.params), trained.opt_state, learning_rate))
 
 

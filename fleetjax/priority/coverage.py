@@ -43,6 +43,7 @@ def similarity(obs: jax.Array) -> jax.Array:
     scaled = known((obs - jnp.mean(obs, axis=0)) / jnp.where(deviation > 1e-6, deviation, 1.0))
     squares = jnp.sum(scaled**2, axis=1)
     apart = squares[:, None] + squares[None] - 2.0 * scaled @ scaled.T
+    apart = jnp.where(jnp.eye(obs.shape[0], dtype=bool), 0.0, apart)  # rounded differently otherwise
     return 1.0 / (1.0 + NEARNESS * jnp.sqrt(jnp.maximum(apart, 0.0) / obs.shape[1]))
 
 

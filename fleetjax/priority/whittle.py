@@ -68,13 +68,13 @@ def whittle(config) -> Priority:
     own = config.parameters
 
     def init():
-        prior = jnp.full((2, 3, 3), PRIOR).at[0, VIOLATED].set(jnp.array([0.0, 0.0, 1.0]))
-        return Chain(prior, PerRobot(jnp.full(config.num_robots, -1)))
+        prior = jnp.full((2, 3, 3), PRIOR, jnp.float32).at[0, VIOLATED].set(jnp.array([0.0, 0.0, 1.0]))
+        return Chain(prior, PerRobot(jnp.full(config.num_robots, -1, jnp.int32)))
 
     def score(signals, past, key):
         del key
         in_danger = (signals.uncertainty > config.uncertainty_threshold) | (signals.risk > config.risk_threshold)
-        state = jnp.where(signals.violation, VIOLATED, jnp.where(in_danger, RISKY, OK))
+        state = jnp.where(signals.violation, VIOLATED, jnp.where(in_danger, RISKY, OK)).astype(jnp.int32)
         before, helped = past.states.values, jnp.zeros_like(signals.violation) if signals.helped is None else signals.helped
         cell = jnp.where(before < 0, -1, 9 * helped.astype(jnp.int32) + 3 * before + state)
         seen = sharding.total((cell[:, None] == jnp.arange(18)).astype(jnp.float32)).reshape(2, 3, 3)

@@ -1,0 +1,442 @@
+"""Rules for help beside the paper's: each against a transcription of its equations in NumPy."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import compiled
+from hypothesis import given
+from hypothesis import strategies as st
+
+import fleetjax
+from fleetjax import HumanState, Signals, priority
+from fleetjax.learning import novelty
+from fleetjax.priority import coverage, quantiles, whittle
+
+N, ACTIONS = 12, 3
+CONFIG = fleetjax.make_config("navigation", num_robots=N, num_humans=4, initial_period=0)
+
+
+def signals_at(t: int, seed: int = 0, **changes) -> Signals:
+    """Return signals of 12 robots: some violated, some helped, some teleoperated by humans who differ from them."""
+    rng = np.random.default_rng([seed, t])
+    flags = [rng.random(N) < 0.2, rng.random(N) < 0.4]
+    violation, helped = map(jnp.asarray, flags)
+    unit = lambda *shape: jnp.asarray(rng.random(shape), jnp.float32)  # noqa: E731
+    correction = jnp.where(helped & ~violation, unit(N), 0.0)
+    names = ("safety", "goal", "discrepancy", "novelty", "intervention", "divergence")
+    signals = Signals(
+        violation=violation,
+        uncertainty=unit(N) * 0.2,
+        risk=unit(N),
+        goal=unit(N),
+        timestep=jnp.int32(t),
+        estimates={name: 2 * unit(N) if name == "novelty" else unit(N) for name in names},
+        obs=unit(N, 5),
+        robot_action=2 * unit(N, ACTIONS) - 1,
+        helped=helped,
+        help_time=helped.astype(jnp.int32),
+        correction=correction,
+        human_action=2 * unit(N, ACTIONS) - 1,
+        link=jnp.ones(N, jnp.float32),
+    )
+    return signals._replace(**changes)
+
+
+@functools.cache
+def scorer(name: str):
+    return compiled(
+        lambda config, signals, aux, key: priority.get_algorithm(name).make_priority(config).score(signals, aux, key)
+    )
+
+
+def scores_of(name: str, steps: list[Signals], **parameters) -> list[np.ndarray]:
+    """Return the scores of consecutive timesteps."""
+    config = CONFIG.replace(algorithm=name, **parameters)
+    aux, found = priority.get_algorithm(name).make_priority(config).init(), []
+    for t, signals in enumerate(steps):
+        score, aux = scorer(name)(config, signals, aux, jax.random.key(t))
+        found.append(np.asarray(score))
+    return found
+
+
+def ranks(asking, violation) -> list[float]:
+    """Return dense ranks of (asking, violation), 0 for (0, 0)."""
+    rows = list(zip(np.asarray(asking, np.float32).tolist(), np.asarray(violation, float).tolist(), strict=True))
+    places = {row: i for i, row in enumerate(sorted(set(rows) | {(0.0, 0.0)}))}
+    return [float(places[row]) for row in rows]
+
+
+def numpy_teleoperated(s: Signals) -> np.ndarray:
+    return np.asarray(s.helped & ~s.violation & (s.correction > 0))
+
+
+# Running quantiles
+
+
+class Oracle:
+    """The running quantile by definition: weighted values in order, in bins of 1 %."""
+
+    def __init__(self, memory: float):
+        self.values, self.weights, self.memory = np.zeros(0), np.zeros(0), memory
+
+    def add(self, values, counted):
+        values = np.clip(np.asarray(values, float)[np.asarray(counted)], quantiles.LOWEST, quantiles.HIGHEST)
+        self.values = np.concatenate([self.values, values])
+        self.weights = np.concatenate([self.weights * np.exp(-1 / self.memory), np.ones(len(values))])
+
+    def bounds(self, level: float) -> tuple[float, float]:
+        """Between which the quantile lies: values at levels a little below and above, a bin wider."""
+        order = np.argsort(self.values)
+        below = np.cumsum(self.weights[order]) / self.weights.sum()
+        low = self.values[order][np.searchsorted(below, level - 1e-4).clip(max=len(order) - 1)]
+        high = self.values[order][np.searchsorted(below, level + 1e-4).clip(max=len(order) - 1)]
+        return low / 1.012, high * 1.012
+
+
+@given(st.integers(0, 100), st.sampled_from([5.0, 1e6]), st.sampled_from([0.01, 0.5, 0.9, 0.999]))
+def test_a_running_quantile_is_that_of_all_values_weighed_by_age(seed, memory, level):
+    rng, oracle, histogram = np.random.default_rng(seed), Oracle(memory), quantiles.empty()
+    for _ in range(4):
+        values, counted = np.exp(rng.normal(0, 3, N)).astype(np.float32), rng.random(N) < 0.8
+        oracle.add(values, counted)
+        histogram = quick_add(histogram, values, counted, jnp.float32(memory))
+    low, high = oracle.bounds(level)
+    assert low <= float(quick_quantile(histogram, level)) <= high
+
+
+quick_add, quick_quantile = compiled(quantiles.add), compiled(quantiles.quantile)
+
+
+def test_the_quantile_of_nothing_is_0():
+    assert float(quantiles.quantile(quantiles.empty(), 0.9)) == 0
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1.0])
+def test_a_gate_at_a_rate_is_asked_at_that_rate_while_the_signal_falls(scale):
+    """Uncertainty falls by a fifth over 600 timesteps; a tenth of the robots ask nevertheless."""
+    rng = np.random.default_rng(0)
+    alone = {"violation": jnp.zeros(N, bool), "helped": jnp.zeros(N, bool), "correction": jnp.zeros(N)}
+    levels = scale * rng.random((600, N)) * np.exp(-np.arange(600) / 3000)[:, None]
+    steps = [signals_at(t, uncertainty=jnp.asarray(level, jnp.float32), **alone) for t, level in enumerate(levels)]
+    parameters = {"quantile_rate": 0.1, "quantile_memory": 50.0}
+    asked = np.mean([np.mean(score > 0) for score in scores_of("quantile_ensemble", steps, **parameters)[100:]])
+    assert 0.07 < asked < 0.12
+    calibrated = scores_of("quantile_ensemble", steps, quantile_calibration=50.0, **parameters)
+    assert np.mean([np.mean(score > 0) for score in calibrated[400:]]) < 0.01
+
+
+# Gates
+
+
+def test_quantile_ensemble():
+    steps, memory = [signals_at(t) for t in range(30)], Oracle(1000.0)
+    for s, score in zip(steps, scores_of("quantile_ensemble", steps, quantile_rate=0.3), strict=True):
+        memory.add(s.uncertainty, ~(s.violation | s.helped))
+        low, high = memory.bounds(0.7)
+        u, violation = np.asarray(s.uncertainty), np.asarray(s.violation)
+        assert np.all(score[(u > high) | violation] > 0)
+        assert not np.any(score[(u < low) & ~violation])
+
+
+@pytest.mark.parametrize("has_goal", [True, False])
+def test_thrifty_quantile(has_goal):
+    steps = [signals_at(t) for t in range(30)]
+    if not has_goal:
+        steps = [s._replace(estimates={}) for s in steps]
+    doubt, chance, number, total = Oracle(1000.0), Oracle(1000.0), 0.0, 0.0
+    kept = 0
+    for s, score in zip(steps, scores_of("thrifty_quantile", steps, thrifty_rate=0.2), strict=True):
+        u, g = np.asarray(s.uncertainty), np.asarray(s.goal if has_goal else 1 - s.risk)
+        alone, taught = ~np.asarray(s.violation | s.helped), numpy_teleoperated(s)
+        doubt.add(u, alone)
+        chance.add(g, alone)
+        number, total = number * np.exp(-1e-3) + taught.sum(), total * np.exp(-1e-3) + np.asarray(s.correction)[taught].sum()
+        (u_low, u_high), (g_low, g_high), (m_low, m_high) = doubt.bounds(0.8), chance.bounds(0.2), chance.bounds(0.5)
+        agrees = np.asarray(s.correction) < total / max(number, 1e-9)
+        sure = (u > u_high) | (g < g_low) | (taught & ~(agrees & (g > m_low)))
+        sure_not = ~((u > u_low) | (g < g_high) | (taught & ~(agrees & (g > m_high)))) & ~np.asarray(s.violation)
+        assert np.all(score[sure] > 0)
+        assert not np.any(score[sure_not])
+        kept += np.sum(taught & sure & ~((u > u_low) | (g < g_high)))
+    assert kept > 0
+
+
+def test_safe_dagger():
+    s = signals_at(0)
+    p = np.asarray(s.estimates["discrepancy"])
+    (score,) = scores_of("safe_dagger", [s], safe_threshold=0.6)
+    assert score.tolist() == ranks(np.where(p >= np.float32(0.6), p, 0), s.violation)
+
+
+def test_lazy_dagger_hands_back_at_a_quarter_of_its_bound():
+    s = signals_at(3)
+    p, correction = np.asarray(s.estimates["discrepancy"]), np.asarray(s.correction)
+    keeps = numpy_teleoperated(s) & (correction >= np.float32(0.25))
+    assert 0 < keeps.sum() < numpy_teleoperated(s).sum()
+    (score,) = scores_of("lazy_dagger", [s], lazy_threshold=0.9, discrepancy_tau=1.0)
+    asking = np.where(p >= np.float32(0.9), p, 0)
+    assert score.tolist() == ranks(np.where(keeps, np.maximum(asking, 1e-6), asking), s.violation)
+
+
+def test_lazy_dagger_has_the_bound_of_its_code():
+    assert float(fleetjax.make_config("navigation", "lazy_dagger").parameters["discrepancy_tau"]) == pytest.approx(0.008 * 4)
+    assert float(fleetjax.make_config("navigation", "safe_dagger").parameters["discrepancy_tau"]) == pytest.approx(0.0025)
+
+
+def test_dropout_dagger_asks_where_few_samples_are_near_the_human():
+    s = signals_at(0, uncertainty=jnp.linspace(0.0, 0.3, N), violation=jnp.zeros(N, bool))
+    offset = jnp.where(jnp.arange(N) % 2 == 0, 0.0, 0.5)[:, None]
+    (score,) = scores_of("dropout_dagger", [s._replace(human_action=s.robot_action + offset)], dropout_threshold=0.5)
+    rng = np.random.default_rng(0)
+    noise = np.sqrt(np.asarray(s.uncertainty))[:, None] * rng.normal(size=(20_000, N, ACTIONS))
+    share = np.mean(np.mean((noise - np.asarray(offset)) ** 2, axis=-1) <= 0.05, axis=0)
+    clear = np.abs(share - 0.5) > 0.35  # four deviations of 32 samples
+    assert clear.sum() >= 6
+    np.testing.assert_array_equal((score > 0)[clear], (share < 0.5)[clear])
+
+
+def test_oracle_discrepancy():
+    s = signals_at(0)
+    d = np.mean((np.asarray(s.robot_action) - np.asarray(s.human_action)) ** 2, axis=-1, dtype=np.float32)
+    (score,) = scores_of("oracle_discrepancy", [s], oracle_threshold=0.4)
+    asks = d >= 0.4
+    assert 0 < asks.sum() < N
+    assert np.all(score[asks] > score[~asks].max())
+    assert np.argmax(score) == np.argmax(d)
+
+
+def test_crsail():
+    s = signals_at(0)
+    d = np.asarray(s.estimates["novelty"])
+    (score,) = scores_of("crsail", [s])
+    assert score.tolist() == ranks(np.where(d >= 1, d, 0), s.violation)
+
+
+def test_the_distance_to_the_kth_neighbour():
+    rng = np.random.default_rng(0)
+    obs, states = rng.normal(size=(7, 4)).astype(np.float32), rng.normal(size=(30, 4)).astype(np.float32)
+    apart = np.sqrt(np.mean((obs[:, None] - states) ** 2, axis=-1))
+    np.testing.assert_allclose(novelty.distance_to(obs, states, 5), np.sort(apart, axis=1)[:, 4], rtol=1e-3)
+
+
+def test_conformal_widens_where_labels_fall_outside_and_only_when_labelled():
+    steps = [signals_at(t) for t in range(12)]
+    quiet = {"helped": jnp.zeros(N, bool), "correction": jnp.zeros(N)}
+    steps[5] = steps[5]._replace(**quiet)
+    half, spread = 1.0, np.ones(N)
+    for s, score in zip(steps, scores_of("conformal", steps, conformal_gain=0.5, conformal_threshold=0.7), strict=True):
+        taught = numpy_teleoperated(s)
+        if taught.any():
+            outside = np.sqrt(np.asarray(s.correction)) > half * spread
+            half *= np.exp(0.5 * (outside[taught].mean() - 0.1))
+        spread = np.sqrt(np.asarray(s.uncertainty)) + 1e-3
+        width = 2 * half * spread
+        asks = width >= 0.7
+        clear = (np.abs(width - 0.7) > 1e-3) & ~np.asarray(s.violation)
+        np.testing.assert_array_equal((score > 0)[clear], asks[clear])
+
+
+@pytest.mark.parametrize(("name", "estimate", "shift"), [("aim", "intervention", 1.0), ("iifl", "divergence", 0.0)])
+def test_gates_by_quantiles_of_an_estimate(name, estimate, shift):
+    steps, memory, asked = [signals_at(t) for t in range(30)], Oracle(1000.0), 0
+    for s, score in zip(steps, scores_of(name, steps, **{f"{name}_rate": 0.2}), strict=True):
+        value = np.asarray(s.estimates[estimate]) + shift
+        memory.add(value, ~(s.violation | s.helped))
+        low, high = memory.bounds(0.8)
+        violation = np.asarray(s.violation)
+        assert np.all(score[(value > high) | violation] > 0)
+        assert not np.any(score[(value < low) & ~violation])
+        asked += np.sum(score[~violation] > 0)
+    assert asked > 0
+
+
+# Queues, bandits, coverage
+
+
+def test_round_robin_serves_all_in_turn():
+    signals = signals_at(0, violation=jnp.zeros(N, bool), helped=jnp.zeros(N, bool))
+    config = CONFIG.replace(algorithm="round_robin", round_robin_threshold=5.0)
+    rule = priority.get_algorithm("round_robin").make_priority(config)
+    memory, served = rule.init(), []
+    for t in range(2 * N):
+        score, memory = rule.score(signals._replace(timestep=jnp.int32(t)), memory, jax.random.key(0))
+        robot = int(jnp.argmax(score))
+        assert float(score[robot]) > 0
+        served.append(robot)
+        signals = signals._replace(helped=jnp.arange(N) == robot)
+    assert served == [*range(N), *range(N)]
+    everyone = signals._replace(helped=jnp.ones(N, bool))
+    assert not np.any(rule.score(everyone, memory, jax.random.key(0))[0])
+
+
+def test_longest_waiting_is_first_come_first_served():
+    since = np.array([0, 3, 1, 9, 2, 9, 9, 9, 9, 9, 9, 9])  # timestep of each violation; 9 = none yet
+    steps = [signals_at(t, violation=jnp.asarray(since <= t)) for t in range(5)]
+    for t, score in enumerate(scores_of("longest_waiting", steps)):
+        assert score.tolist() == np.maximum(t + 1 - since, 0).tolist()
+
+
+def numpy_index(chains: np.ndarray, discount: float, state: int) -> float:
+    """Return the Whittle index by value iteration and bisection."""
+    low, high = -1 / (1 - discount), 1 / (1 - discount)
+    for _ in range(40):
+        price = (low + high) / 2
+        value = np.zeros(3)
+        for _ in range(400):
+            q = [np.array(whittle.WORTH) - price * a + discount * chains[a] @ value for a in (0, 1)]
+            value = np.maximum(*q)
+        low, high = (price, high) if q[1][state] > q[0][state] else (low, price)
+    return (low + high) / 2
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_whittle_indices(seed):
+    chains = np.random.default_rng(seed).dirichlet(np.ones(3), size=(2, 3))
+    chains[0, 2] = 0, 0, 1
+    expected = [numpy_index(chains, 0.9, state) for state in range(3)]
+    found = whittle.indices(*jnp.asarray(chains, jnp.float32), jnp.float32(0.9))
+    np.testing.assert_allclose(found, expected, atol=2e-3)
+
+
+def test_whittle_counts_transitions_with_and_without_help():
+    steps = [signals_at(t) for t in range(6)]
+    config = CONFIG.replace(algorithm="whittle", uncertainty_threshold=0.1, risk_threshold=0.5)
+    rule = priority.get_algorithm("whittle").make_priority(config)
+    memory, counts, before = rule.init(), np.ones((2, 3, 3)), None
+    counts[0, 2] = 0, 0, 1
+    for s in steps:
+        score, memory = rule.score(s, memory, jax.random.key(0))
+        risky = (np.asarray(s.uncertainty) > 0.1) | (np.asarray(s.risk) > 0.5)
+        state = np.where(s.violation, 2, np.where(risky, 1, 0))
+        if before is not None:
+            np.add.at(counts, (np.asarray(s.helped).astype(int), before, state), 1)
+        np.testing.assert_array_equal(memory.transitions, counts)
+        assert len(np.unique(np.stack([state, score]), axis=1).T) == len(np.unique(state))
+        before = state
+
+
+def numpy_coverage(weight, alike, bound, number, threshold, link):
+    """Return the robots that greedy facility location picks, in order."""
+    picked, chosen = [], [i for i in range(len(weight)) if bound[i]]
+
+    def covered(robots):
+        return sum(weight[i] * max((alike[i, j] for j in robots), default=0.0) for i in range(len(weight)))
+
+    for _ in range(number):
+        gains = {
+            j: (covered([*chosen, j]) - covered(chosen)) * link[j]
+            for j in range(len(weight))
+            if weight[j] > 0 and j not in chosen and not bound[j]
+        }
+        best = max(gains, key=gains.__getitem__, default=None)
+        if best is None or gains[best] < threshold:
+            break
+        picked.append(best)
+        chosen.append(best)
+    return picked
+
+
+@pytest.mark.parametrize("threshold", [0.0, 0.9])
+@pytest.mark.parametrize("seed", range(3))
+def test_asa_covers_greedily(seed, threshold):
+    link = np.random.default_rng(seed).uniform(0.2, 1.0, N).astype(np.float32)
+    s = signals_at(0, seed, link=jnp.asarray(link))
+    config = CONFIG.replace(algorithm="asa", asa_threshold=threshold, uncertainty_threshold=0.1, risk_threshold=0.3)
+    algorithm = priority.get_algorithm("asa")
+    weight, _ = algorithm.make_priority(config).score(s, (), jax.random.key(0))
+    u, r, c = (np.asarray(x, float) for x in (s.uncertainty, s.risk, s.violation))
+    expected = 0.097 * u * (u >= 0.1) + 0.903 * r * (r >= 0.3) + 1e4 * c
+    np.testing.assert_allclose(weight, expected, rtol=1e-6)
+    weight = jnp.where(s.violation, 0.0, weight)  # else sums of 10,000 hide the rest
+    humans = HumanState(jnp.array([3, -1, -1, -1], jnp.int32), jnp.array([1, 0, 0, 0], jnp.int32))
+    found = algorithm.make_allocate(config)(weight, humans, jnp.full(N, 5), jax.random.key(0), None, s)
+    obs = np.asarray(s.obs, float)
+    obs = (obs - obs.mean(0)) / obs.std(0)
+    alike = 1 / (1 + 4.89 * np.sqrt(np.mean((obs[:, None] - obs) ** 2, axis=-1)))
+    np.testing.assert_allclose(coverage.similarity(s.obs), alike, atol=1e-3)
+    picked = numpy_coverage(np.asarray(weight, float), alike, np.arange(N) == 3, 3, threshold, link)
+    assert np.asarray(found.robot).tolist() == [3, *picked, *[-1] * (3 - len(picked))]
+
+
+def test_asa_leaves_violations_in_the_initial_period():
+    s = signals_at(10)
+    before, after = (
+        scorer("asa")(CONFIG.replace(algorithm="asa", initial_period=period), s, (), jax.random.key(0))[0]
+        for period in (11, 10)
+    )
+    assert np.any(s.violation)
+    np.testing.assert_allclose(after - before, 1e4 * np.asarray(s.violation), rtol=1e-3)
+
+
+# Estimators, in a fleet
+
+
+@functools.cache
+def learnt(name: str):
+    """Return estimates at the start and after 150 timesteps, and the fleet's states, of an algorithm on navigation."""
+    config = fleetjax.make_config("navigation", name, num_robots=20, num_humans=5, num_steps=150)
+    config = config.replace(critic_pretraining_steps=200)
+    result = compiled(fleetjax.run)(config, jax.random.key(0))
+    return config, result
+
+
+def estimator_of(name: str, estimate: str):
+    from fleetjax.fleet import make_parts
+
+    config, result = learnt(name)
+    parts = make_parts(config, fleetjax.envs.make("navigation"))
+    return parts, result.state, parts.estimators[estimate]
+
+
+@pytest.mark.slow
+def test_the_discrepancy_classifier_tells_where_the_policy_is_wrong():
+    parts, state, estimator = estimator_of("lazy_dagger", "discrepancy")
+    pairs = jax.tree.map(lambda x: x[: int(state.human_data.pairs.size)], state.human_data.pairs.rows)
+    action, _ = parts.learner.predict(state.policy, pairs.obs)
+    wrong = np.mean((np.asarray(action) - np.asarray(pairs.action)) ** 2, axis=-1) > 0.032
+    chance = np.asarray(estimator.value(state.estimators["discrepancy"], state.policy, pairs.obs, action))
+    assert 20 < wrong.sum() < wrong.size - 20
+    assert np.mean(chance[wrong]) > np.mean(chance[~wrong]) + 0.1
+
+
+@pytest.mark.slow
+def test_the_proxy_value_is_low_for_what_humans_do():
+    parts, state, estimator = estimator_of("aim", "intervention")
+    pairs = jax.tree.map(lambda x: x[: int(state.human_data.pairs.size)], state.human_data.pairs.rows)
+    action, _ = parts.learner.predict(state.policy, pairs.obs)
+    apart = np.mean((np.asarray(action) - np.asarray(pairs.action)) ** 2, axis=-1)
+    theirs, own = (
+        estimator.value(state.estimators["intervention"], state.policy, pairs.obs, a) for a in (pairs.action, action)
+    )
+    worst = apart > np.quantile(apart, 0.9)
+    assert np.mean(np.asarray(own - theirs)[worst]) > 0.2
+
+
+@pytest.mark.slow
+def test_energies_and_neighbours_tell_states_apart_that_no_human_saw():
+    for name, estimate in (("iifl", "divergence"), ("crsail", "novelty")):
+        parts, state, estimator = estimator_of(name, estimate)
+        obs = state.human_data.pairs.rows.obs[:200]
+        far = obs + 3.0 * jnp.std(obs, axis=0)
+        known, new = (
+            np.asarray(estimator.value(state.estimators[estimate], state.policy, x, parts.learner.predict(state.policy, x)[0]))
+            for x in (obs, far)
+        )
+        assert np.median(new) > 1.5 * np.median(known), name
+
+
+def test_the_radius_is_the_quantile_of_demonstrations():
+    from fleetjax.fleet import make_parts
+
+    config = fleetjax.make_config("navigation", "crsail", num_robots=8, num_humans=2, num_steps=5, pretraining_steps=0)
+    state = compiled(fleetjax.prepare)(config, jax.random.key(0))
+    parts, seen = make_parts(config, fleetjax.envs.make("navigation")), state.estimators["novelty"]
+    known = np.asarray(state.policy.normalizer(seen.states), np.float64)
+    apart = np.sqrt(np.mean((known[:, None] - known) ** 2, axis=-1))
+    expected = np.quantile(np.sort(apart, axis=1)[:, novelty.NEIGHBOURS], 0.95)
+    assert float(seen.radius) == pytest.approx(expected, rel=0.02)
+    value = parts.estimators["novelty"].value(seen, state.policy, seen.states, jnp.zeros((len(known), 2)))
+    assert np.mean(np.asarray(value) >= 1) < 0.05

@@ -33,7 +33,7 @@ _KNOWN = {
     "lazy_dagger": ("LazyDAgger", "as safe_dagger; humans hand back only once they agree with the robot"),
     "dropout_dagger": (
         "DropoutDAgger",
-        "robots few of whose sampled actions are near the human's; sees the human's action first",
+        "robots few of whose sampled actions are near the human's, which it sees first",
     ),
     "oracle_discrepancy": ("Oracle", "robots farthest from what the human would do, which it sees: a ceiling, not a rule"),
     "crsail": ("CRSAIL", "robots far from all states in which humans acted"),

@@ -24,7 +24,7 @@ from fleetjax.io.study import Study, make_study, plan
 from fleetjax.priority import get_algorithm
 
 HERE = Path(__file__).parent
-PARTS = ("main", "gradient_steps", "policies", "ablations", "humans", "times")  # in this order
+PARTS = ("main", "gradient_steps", "policies", "ablations", "humans", "times", "equal_budget")  # in this order
 TRAINED = "main"  # the part whose policies are evaluated
 METRICS = {
     "main": ("successes", "violations", "idle", "rohe", "rohe_with_demonstrations"),

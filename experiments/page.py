@@ -4,7 +4,7 @@
 
 A table stands between `<!-- NAME -->` and `<!-- end -->`, where NAME is one of:
 
-- `main`, `gradient_steps`: what the algorithms achieved in that part, each robot's one after the other.
+- a part of the study, such as `main`: what the algorithms achieved in it, each robot's one after the other.
 - `claims`: the verdicts of `claims.py`.
 - `missing`: how many runs of each part are stored, of how many.
 """
@@ -46,14 +46,17 @@ def mean(one: Group, metric: str, *, spread: bool = False) -> str:
 
 def achieved(found: list[Group], alone: Mapping[str, Group]) -> str:
     """Return a table of what groups of runs achieved, and of what their policies did `alone`, by name."""
-    head = ["", "seeds", *COLUMNS.values(), "ROHE, demonstrations counted"]
+    columns = COLUMNS if alone else {**COLUMNS, "idle": "idle time"}
+    counted = any("constraint" in one.config.algorithm for one in found)
+    head = ["", "seeds", *columns.values(), *(["ROHE, demonstrations counted"] if counted else [])]
     policies = ["policy alone: successes", "violations", "the paper's policy: successes"] if alone else []
     table = [tuple(head + policies)]
     for one in sorted(found, key=lambda one: [*claims.NAMES].index(one.config.environment)):
         place, algorithm = one.config.environment, one.config.algorithm
         cells = [f"{claims.NAMES[place]}, {one.label}", str(len(one.runs))]
-        cells += [mean(one, metric, spread=metric == "successes") for metric in COLUMNS]
-        cells += [mean(one, "rohe_with_demonstrations") if "constraint" in algorithm else ""]
+        cells += [mean(one, metric, spread=metric == "successes") for metric in columns]
+        if counted:
+            cells += [mean(one, "rohe_with_demonstrations") if "constraint" in algorithm else ""]
         if alone:
             policy = alone.get(f"{place} {one.label}")
             paper_value = PUBLISHED.get(place, {}).get(algorithm)
@@ -89,9 +92,8 @@ def main() -> None:
     every = argparse.Namespace(
         results=args.results, studies=paper.HERE / "studies", seeds=None, workers=1, output=Path("runs/paper")
     )
-    tables = {
-        "main": achieved(groups(args.results, "main"), alone),
-        "gradient_steps": achieved(groups(args.results, "gradient_steps"), {}),
+    parts = [part for part in paper.PARTS if part != "policies"]
+    tables = {part: achieved(groups(args.results, part), alone if part == paper.TRAINED else {}) for part in parts} | {
         "claims": claims.verdicts(claims.Study(args.results)),
         "missing": missing(every),
     }

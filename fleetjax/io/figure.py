@@ -215,7 +215,10 @@ def _spread(ax: Axes, ends: Sequence[float]) -> None:
 
 
 def _styles(groups: Sequence[Curves]) -> list[tuple[str, Any]]:
-    """Return colour and dashes of each line: an algorithm's own colour, dashes where it comes again with another label."""
+    """Return colour and dashes of each line: an algorithm's own colour, dashes where it comes again with another label.
+
+    An algorithm with more labels than there are dashes gets a colour from dark to light for each.
+    """
     names = list(dict.fromkeys(curves.algorithm for curves in groups))
     spare = iter(colour for colour in _OTHERS if colour not in {_COLOURS.get(name) for name in names})
     colours = dict(_COLOURS)
@@ -223,7 +226,15 @@ def _styles(groups: Sequence[Curves]) -> list[tuple[str, Any]]:
         if name not in colours:
             colours[name] = next(spare, _OTHERS[i % len(_OTHERS)])
     labels = {name: list(dict.fromkeys(c.label for c in groups if c.algorithm == name)) for name in names}
-    return [(colours[c.algorithm], _DASHES[labels[c.algorithm].index(c.label) % len(_DASHES)]) for c in groups]
+
+    def style_of(curves: Curves) -> tuple[str, Any]:
+        own = labels[curves.algorithm]
+        place = own.index(curves.label)
+        many = len(own) > len(_DASHES)
+        shade = mpl.colors.to_hex(mpl.colormaps["viridis"](0.92 * place / max(len(own) - 1, 1)))
+        return shade if many else colours[curves.algorithm], _DASHES[place % len(_DASHES)]
+
+    return [style_of(curves) for curves in groups]
 
 
 def render(figure: Figure, suffix: str = ".png") -> bytes:

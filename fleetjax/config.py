@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from fleetjax import envs, priority, supervisors
-from fleetjax.field import FIELDS, KINDS, Field, Fields, owners
+from fleetjax import envs, humans, priority, supervisors
+from fleetjax.field import FIELDS, KINDS, OF_HUMANS, SHAPES_OF_HUMANS, Field, Fields, owners
 from fleetjax.physics.base import BACKENDS
 from fleetjax.priority import estimators_of
 from fleetjax.registry import unknown
@@ -98,6 +98,8 @@ def _typed(name: str, field: Field, value: Any) -> Any:
     Raises:
         ValueError: if it has another type, or is an integer beyond 32 bits.
     """
+    if field.per_human and isinstance(value, (tuple, list)):
+        return tuple(_as_array(name, field, one) for one in value)
     return _as_array(name, field, value) if field.traced else _as_static(name, field, value)
 
 
@@ -233,6 +235,8 @@ def make_config(environment: "str | envs.Env", algorithm: str = "cur", **overrid
             raise ValueError(_not_known(override, algorithm))
     of_place = {key: value for key, value in defaults.items() if key in known}
     of_field = {key: field.default for key, field in known.items()}
+    if any(override in OF_HUMANS for override in overrides):
+        overrides = {"human_model": "imperfect"} | overrides
     config = Config().replace(**of_field | of_place | {"environment": name, "algorithm": algorithm} | overrides)
     of_others = dict(priority.get_algorithm(algorithm).defaults(config))
     bar = (env or envs.make(name, config.backend)).spec.success_return
@@ -283,6 +287,7 @@ def validate(config: Config, env: "envs.Env | None" = None) -> None:
             "leave it at 1"
         )
     algorithm.check(config, env.spec)
+    _check_humans(config)
     if config.allocation == "soft":
         _check_soft(config, algorithm, env)
     if "goal" in estimators_of(algorithm, env.spec) and not env.spec.has_goal:
@@ -290,6 +295,27 @@ def validate(config: Config, env: "envs.Env | None" = None) -> None:
             f"algorithm = {config.algorithm!r} needs a goal to learn from, and environment = {env.spec.name!r} has none; "
             "choose another algorithm, or an environment with goals"
         )
+
+
+def _check_humans(config: Config) -> None:
+    """Check what is said of humans and links.
+
+    Raises:
+        ValueError: if a name is unknown, a tuple has not a value for each human, or a value would have no effect.
+    """
+    humans.HUMAN_MODELS.get(config.human_model)
+    humans.LINK_MODELS.get(config.link_model)
+    for name in OF_HUMANS:
+        value = getattr(config, name)
+        if isinstance(value, tuple) and len(value) != config.num_humans:
+            raise ValueError(
+                f"{name} has {len(value)} values for num_humans = {config.num_humans}; give one for each human, or one for all"
+            )
+        idle = config.human_model == "perfect" and name not in SHAPES_OF_HUMANS
+        if idle and any(_is_concrete(x) and np.any(np.asarray(x) != 0) for x in jax.tree.leaves(value)):
+            raise ValueError(f"{name} has no effect with human_model = 'perfect'; also pass human_model = 'imperfect'")
+    if config.allocation == "soft" and (config.human_model, config.link_model) != ("perfect", "perfect"):
+        raise ValueError("allocation = 'soft' needs human_model = 'perfect' and link_model = 'perfect'")
 
 
 def _check_soft(config: Config, algorithm: priority.Algorithm, env: envs.Env) -> None:
@@ -313,6 +339,10 @@ def _check_soft(config: Config, algorithm: priority.Algorithm, env: envs.Env) ->
 
 
 def _check_range(name: str, value: Any, field: Field) -> None:
+    if field.per_human and isinstance(value, tuple):
+        for one in list(value):
+            _check_range(name, one, field)
+        return
     if field.kind in (str, tuple, bool) or not _is_concrete(value):
         return
     values = np.asarray(value, np.float64)  # holds derived whole numbers that no integer type does

@@ -44,6 +44,8 @@ def place(state: FleetState) -> FleetState:
     def put_memory(x: Any) -> Any:
         return sharding.pin(x, sharding.DIVIDED) if isinstance(x, PerRobot) else sharding.everywhere(x)
 
+    memories = (state.priority, state.people, state.links)
+    memory, people, links = jax.tree.map(put_memory, memories, is_leaf=lambda x: isinstance(x, PerRobot))
     others = (state.timestep, state.humans, state.policy, state.human_data)
     timestep, humans, policy, human_data = sharding.everywhere(others)
     return state._replace(
@@ -55,7 +57,9 @@ def place(state: FleetState) -> FleetState:
         policy=policy,
         human_data=human_data,
         estimators=_map(put, state.estimators),
-        priority=jax.tree.map(put_memory, state.priority, is_leaf=lambda x: isinstance(x, PerRobot)),
+        priority=memory,
+        people=people,
+        links=links,
     )
 
 

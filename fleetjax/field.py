@@ -30,6 +30,7 @@ class Field(NamedTuple):
         low: smallest allowed value.
         high: largest allowed value.
         default: value unless another is given.
+        per_human: whether it may be a tuple with a value for each human.
     """
 
     help: str
@@ -39,6 +40,7 @@ class Field(NamedTuple):
     low: float | None = 0
     high: float | None = None
     default: Any = 0.0
+    per_human: bool = False
 
 
 def _static(default: Any, help: str, unit: str = "", *, low: float | None = None) -> Any:
@@ -51,6 +53,11 @@ def _traced(default: Any, help: str, unit: str = "", *, low: float | None = 0, h
     return dataclasses.field(default=default, metadata={"field": field})
 
 
+def _of_humans(default: float, help: str, unit: str = "", *, low: float = 0, high: float | None = None) -> Any:
+    field = Field(help, unit, float, True, low, high, default, per_human=True)
+    return dataclasses.field(default=default, metadata={"field": field})
+
+
 @dataclasses.dataclass(frozen=True)
 class Fields:
     """The parameters that every run has. Static ones shape the program, traced ones are arrays."""
@@ -60,6 +67,8 @@ class Fields:
     supervisor: str = _static("", "name of the supervisor; empty = the environment's own")
     backend: str = _static("auto", "physics backend: native (CPU threads), mjx (pure JAX), auto")
     allocation: str = _static("hard", "hard, or soft: relaxed for derivatives (algorithms with differentiable scores)")
+    human_model: str = _static("perfect", "name of the model of humans: perfect, or imperfect, which has parameters below")
+    link_model: str = _static("perfect", "connections to the robots: perfect, gilbert_elliott, unequal, swapping")
     num_robots: int = _static(100, "robots N", low=1)
     num_humans: int = _static(10, "human supervisors M, at most N", low=1)
     num_steps: int = _static(10_000, "operation time T", "timesteps", low=1)
@@ -106,8 +115,26 @@ class Fields:
     goal_discount: float = _traced(0.999, "discount of the goal critic", high=1)
     target_rate: float = _traced(2e-4, "rate at which target networks follow, per gradient step", high=1)
 
+    action_noise: float = _of_humans(0.0, "humans: standard deviation of the noise on their actions")
+    mistake_rate: float = _of_humans(0.0, "humans: chance of a random action", high=1)
+    takeover_time: float = _of_humans(0.0, "humans: mean time from their assignment to their first action", "timesteps")
+    takeover_spread: float = _of_humans(0.5, "humans: standard deviation of that time, as a share of its mean")
+    action_delay: float = _of_humans(0.0, "humans: time by which their actions are late", "timesteps", high=10)
+    switching_lag: float = _of_humans(0.0, "humans: further time if they come from another robot", "timesteps")
+    fatigue: float = _of_humans(0.0, "humans: growth of takeover time and noise for one who is always busy, as a share")
+    absence: float = _of_humans(0.0, "humans: share of the time in which they are away", high=0.99)
+    absence_time: float = _of_humans(100.0, "humans: mean time for which they are away", "timesteps", low=1)
+    link_failure_rate: float = _traced(0.01, "links, gilbert_elliott: chance that one that works fails, per timestep", high=1)
+    link_repair_rate: float = _traced(
+        0.1, "links, gilbert_elliott: chance that one that failed is repaired, per timestep", high=1
+    )
+
 
 FIELDS: dict[str, Field] = {f.name: f.metadata["field"] for f in dataclasses.fields(Fields)}
+
+# What only the imperfect human model has, and makes no difference at its default or alone.
+OF_HUMANS = tuple(name for name, field in FIELDS.items() if field.per_human)
+SHAPES_OF_HUMANS = ("takeover_spread", "absence_time")
 
 # What acts only before the fleet starts.
 OFFLINE = (

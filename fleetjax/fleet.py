@@ -13,11 +13,12 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from fleetjax import metrics, priority, sharding, soft, supervisors
+from fleetjax import humans, metrics, priority, sharding, soft, supervisors
 from fleetjax.allocation import Allocator, helper_of
 from fleetjax.config import Config
 from fleetjax.envs import Env
-from fleetjax.keys import Keys, split_keys
+from fleetjax.humans import HumanModel, Links
+from fleetjax.keys import Keys, key_of_links, key_of_people, split_keys
 from fleetjax.learning import buffer, imitation
 from fleetjax.learning.critic import CriticState
 from fleetjax.learning.estimator import Estimator, Step
@@ -55,6 +56,8 @@ class FleetState(NamedTuple):
         priority: the priority's own memory.
         origin: what it was prepared for.
         weight: f32[N] how much of a human each robot had at the last timestep, in the soft allocation; None in the hard one.
+        people: what the human model carries; nothing for perfect humans.
+        links: PerRobot of bool[N], which links worked at the last timestep; nothing if all always do.
     """
 
     timestep: jax.Array
@@ -68,6 +71,8 @@ class FleetState(NamedTuple):
     priority: Any
     origin: Origin = Origin("", "")
     weight: Any = None
+    people: Any = ()
+    links: Any = ()
 
     @property
     def learner(self) -> PolicyState:
@@ -87,6 +92,8 @@ class Parts(NamedTuple):
     supervisor: Supervisor
     learner: Learner
     estimators: dict[str, Estimator]
+    people: HumanModel | None = None
+    links: Links | None = None
 
 
 class Fleet(NamedTuple):
@@ -116,7 +123,10 @@ def make_parts(config: Config, env: Env) -> Parts:
     estimators = {name: ESTIMATORS.get(name)(config, env, learner, supervisor) for name in learnt}
     rule, allocator = algorithm.make_priority(config), algorithm.make_allocate(config)
     binding = algorithm.make_priority(config.replace(allocation="hard")) if config.allocation == "soft" else rule
-    return Parts(config, env, algorithm, rule, binding, allocator, supervisor, learner, estimators)
+    make_people, make_links = humans.HUMAN_MODELS.get(config.human_model), humans.LINK_MODELS.get(config.link_model)
+    people = make_people(config, env.spec) if make_people else None
+    links = make_links(config) if make_links else None
+    return Parts(config, env, algorithm, rule, binding, allocator, supervisor, learner, estimators, people, links)
 
 
 def make_fleet(config: Config, env: Env) -> Fleet:
@@ -153,16 +163,26 @@ def init(parts: Parts, key: jax.Array, policy: PolicyState, data: HumanData, est
         priority=parts.rule.init(),
         origin=Origin(parts.env.spec.name, config.algorithm),
         weight=jnp.zeros(n, jnp.float32) if config.allocation == "soft" else None,
+        people=parts.people.init(config, key_of_people(key)) if parts.people else (),
+        links=priority.PerRobot(parts.links.init(key_of_links(key))) if parts.links else (),
     )
 
 
 def logged_step(parts: Parts, state: FleetState, key: jax.Array) -> tuple[FleetState, tuple[Metrics, Interventions]]:
     """Take a timestep with the simulated supervisor; return also what each human who teleoperated saw and did."""
     keys = split_keys(key, parts.config.num_robots)
-    state, planned = plan(parts, state, keys)
-    human_action = supervise(parts, state.env, keys)
-    after, counts, stepped = act(parts, state, planned, human_action, planned.teleoperated, keys)
-    return after, (counts, watch(state.env, planned, human_action, stepped))
+    there = parts.people.available(state.people, key_of_people(key)) if parts.people else None
+    state, planned = plan(parts, state, keys, there)
+    human_action, given = supervise(parts, state.env, keys), planned.teleoperated
+    people, links = state.people, state.links
+    if parts.people:
+        people, human_action, given = parts.people.act(people, planned, human_action, key_of_people(key))
+    if parts.links:
+        works = humans.draw(planned.signals.link, key_of_links(key))
+        given, links = given & works, priority.PerRobot(works)
+    after, counts, stepped = act(parts, state, planned, human_action, given, keys)
+    after = after._replace(people=people, links=links)
+    return after, (counts, watch(state.env, planned._replace(teleoperated=given), human_action, stepped))
 
 
 def plan(parts: Parts, state: FleetState, keys: Keys, available: jax.Array | None = None) -> tuple[FleetState, Plan]:
@@ -236,7 +256,7 @@ def observe(parts: Parts, state: FleetState, keys: Keys) -> Signals:
         help_time=jnp.where(helper >= 0, state.humans.duration[helper], 0),
         correction=state.correction,
         human_action=supervise(parts, state.env, keys) if parts.algorithm.sees_supervisor else None,
-        link=jnp.ones(n, jnp.float32),
+        link=parts.links.quality(state.links.values, state.timestep) if parts.links else jnp.ones(n, jnp.float32),
     )
 
 

@@ -40,6 +40,16 @@ def key_at(key: jax.Array, timestep: jax.Array | int) -> jax.Array:
     return jax.random.fold_in(key, timestep + 1)
 
 
+def key_of_people(key: jax.Array) -> jax.Array:
+    """Return the key of the human model, at the timestep whose key is given; `split_keys` has other ones."""
+    return jax.random.fold_in(key, 2**31 - 1)
+
+
+def key_of_links(key: jax.Array) -> jax.Array:
+    """Return the key of the links, at the timestep whose key is given."""
+    return jax.random.fold_in(key, 2**31 - 2)
+
+
 def split_keys(key: jax.Array, num_robots: int) -> Keys:
     """Return the keys of the timestep whose key is given, by a single split, which compiles and runs fastest."""
     if sharding.division() is None:

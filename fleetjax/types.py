@@ -63,7 +63,7 @@ class Signals(NamedTuple):
         correction: f32[N] mean squared difference between the human's and the robot's action, if the robot was teleoperated
             at the last timestep; else 0.
         human_action: f32[N, A] what the supervisor would do; None unless the algorithm has `sees_supervisor`.
-        link: f32[N] quality of the connection to each robot; always 1 so far.
+        link: f32[N] chance that the link to each robot works at this timestep; 1 with `link_model = "perfect"`.
     """
 
     violation: jax.Array

@@ -395,6 +395,16 @@ def _number(text: str) -> float:
         raise argparse.ArgumentTypeError(f"{text!r} must be a number") from None
 
 
+def _number_or_file(text: str) -> float | tuple[float, ...]:
+    """Return a number, or of @FILE the numbers that it holds, one for each human, separated by white space."""
+    if not text.startswith("@"):
+        return _number(text)
+    try:
+        return tuple(map(_number, Path(text[1:]).read_text().split()))
+    except (OSError, UnicodeDecodeError) as error:
+        raise argparse.ArgumentTypeError(f"{text[1:]} cannot be read: {error}") from None
+
+
 def _switch(text: str) -> bool:
     if text not in ("on", "off"):
         raise argparse.ArgumentTypeError(f"{text!r} must be on or off")

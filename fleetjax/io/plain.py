@@ -7,10 +7,17 @@ from typing import Any
 import numpy as np
 
 from fleetjax.config import Config, all_fields, get_value, validate
-from fleetjax.field import KINDS
+from fleetjax.field import KINDS, OF_HUMANS, Field
 from fleetjax.io.files import expect
 
-_LATER = ("allocation", "temperature")  # fields that came later; their defaults are what was done before
+_LINKS = ("link_model", "link_failure_rate", "link_repair_rate")
+_LATER = (
+    "allocation",
+    "temperature",
+    "human_model",
+    *OF_HUMANS,
+    *_LINKS,
+)  # fields that came later; their defaults are what was done before
 _LARGEST = 2**31 - 1  # traced integers are i32
 
 
@@ -20,6 +27,8 @@ def to_plain(config: Config) -> dict[str, Any]:
     def plain(value: Any, kind: type) -> Any:
         if kind is tuple:
             return list(value)
+        if isinstance(value, tuple):  # one for each human
+            return [plain(one, kind) for one in value]
         return float(str(np.float32(value))) if kind is float else kind(value)
 
     return {name: plain(get_value(config, name), field.kind) for name, field in all_fields(config.algorithm).items()}
@@ -36,7 +45,7 @@ def from_plain(fields: Mapping[str, Any]) -> Config:
     for problem, names in (("unknown", set(fields) - set(known)), ("missing", set(known) - set(fields))):
         expect(not names, f"{problem} fields: {', '.join(sorted(names))} (another version of fleetjax?)")
     for name, value in fields.items():
-        expect(fits(value, known[name].kind), f"{name} = {value!r} must be {KINDS[known[name].kind]}")
+        expect(_fits_field(value, known[name]), f"{name} = {value!r} must be {KINDS[known[name].kind]}")
     config = Config().replace(**{**fields, "human_capacity": 0})
     if fields["human_capacity"] not in (0, config.human_capacity):  # it was asked for, and does not follow from the others
         config = config.replace(human_capacity=fields["human_capacity"])
@@ -46,6 +55,12 @@ def from_plain(fields: Mapping[str, Any]) -> Config:
 
 def _is_int(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and abs(value) <= _LARGEST
+
+
+def _fits_field(value: Any, field: Field) -> bool:
+    if field.per_human and isinstance(value, list):
+        return all(fits(one, field.kind) for one in value)
+    return fits(value, field.kind)
 
 
 def fits(value: Any, kind: type) -> bool:

@@ -1,0 +1,217 @@
+"""People who are not perfect supervisors: they take time, make mistakes, answer late, tire, and are away at times."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from fleetjax.allocation import helper_of
+from fleetjax.envs import EnvSpec
+from fleetjax.priority import PerRobot
+from fleetjax.registry import Registry
+from fleetjax.types import Plan
+
+LONGEST_DELAY = 10  # timesteps of `action_delay` at most: so many actions are remembered for each robot
+TIRING = 1000.0  # timesteps within which fatigue follows how busy a human is
+
+
+class HumanModel(NamedTuple):
+    """What stands between the simulated supervisor and the robots.
+
+    Attributes:
+        init: `(config, key) -> aux`, at t = 0.
+        available: `(aux, key) -> bool[M]`, the humans who are there.
+        act: `(aux, Plan, action f32[N, A], key) -> (aux, action f32[N, A], given bool[N])`: what humans really do, of what the
+            supervisor would do, and on which robots. On the others their own policy acts, and nothing is recorded.
+    """
+
+    init: Callable[[Any, jax.Array], Any]
+    available: Callable[[Any, jax.Array], jax.Array]
+    act: Callable[[Any, Plan, jax.Array, jax.Array], tuple[Any, jax.Array, jax.Array]]
+
+
+class People(NamedTuple):
+    """What the imperfect humans carry from one timestep to the next.
+
+    Attributes:
+        robot: i32[M] whom they helped at the last timestep, -1 = nobody.
+        wait: f32[M] timesteps until they act on it.
+        busy: f32[M] share of the last timesteps in which they were busy, in [0, 1].
+        away: bool[M].
+        past: f32[N, LONGEST_DELAY, A] what the supervisor would have done on each robot, the latest first.
+    """
+
+    robot: jax.Array
+    wait: jax.Array
+    busy: jax.Array
+    away: jax.Array
+    past: PerRobot
+
+
+def per_human(value: Any, num_humans: int) -> jax.Array:
+    """Return f32[M], the value of a parameter for each human: one for all, or a tuple of M."""
+    if isinstance(value, tuple):
+        return jnp.stack([jnp.asarray(x, jnp.float32) for x in value])
+    return jnp.full(num_humans, value, jnp.float32)
+
+
+def takeover_times(mean: jax.Array, spread: jax.Array, key: jax.Array) -> jax.Array:
+    """Return f32[M] draws from lognormal distributions with means f32[M] and standard deviations `spread` times these.
+
+    Reference: Zhang et al., Determinants of take-over time, 2019, a meta-analysis of 129 studies: the standard deviation is in
+    proportion to the mean, which is about 2.7 s.
+    """
+    variance = jnp.log1p(spread**2)
+    return mean * jnp.exp(jnp.sqrt(variance) * jax.random.normal(key, mean.shape) - variance / 2)
+
+
+def make_imperfect(config: Any, spec: EnvSpec) -> HumanModel:
+    """Build the model whose parameters are `action_noise` to `absence_time` of `Config`.
+
+    - Takeover: a human who comes to a robot acts on it only after a takeover time, and `switching_lag` more if it comes from
+      another robot. Meanwhile the robot's policy acts; the human's time counts. Hard resets take t_R as ever.
+    - Delay: the action is the one for what the robot was in `action_delay` timesteps ago.
+    - Skill: normal noise on continuous actions, and a random action in its place with `mistake_rate`.
+    - Fatigue: takeover time and noise are multiplied by 1 + `fatigue` b, for the share b of recent time in which the human was
+      busy.
+    - Absence: each human comes and goes as a two-state chain, away for a share `absence` of the time.
+
+    With all of them 0, humans do what perfect ones do.
+    """
+    n, m = config.num_robots, config.num_humans
+    fields = ("action_noise", "mistake_rate", "takeover_time", "takeover_spread", "action_delay", "switching_lag", "fatigue")
+    noise, mistakes, takeover, spread, delay, lag, fatigue, absence, absence_time = (
+        per_human(getattr(config, name), m) for name in (*fields, "absence", "absence_time")
+    )
+
+    def init(config: Any, key: jax.Array) -> People:
+        del config
+        away = jax.random.uniform(key, (m,)) < absence
+        nobody, none = jnp.full(m, -1, jnp.int32), jnp.zeros(m, jnp.float32)
+        return People(nobody, none, none, away, PerRobot(jnp.zeros((n, LONGEST_DELAY, spec.action_size))))
+
+    def available(people: People, key: jax.Array) -> jax.Array:
+        del key
+        return ~people.away
+
+    def act(people: People, plan: Plan, action: jax.Array, key: jax.Array) -> tuple[People, jax.Array, jax.Array]:
+        key_time, key_noise, key_whether, key_what, key_away = jax.random.split(key, 5)
+        robot, tired = plan.humans.robot, 1.0 + fatigue * people.busy
+        comes = (robot >= 0) & (robot != people.robot)
+        pause = takeover_times(takeover * tired, spread, key_time) + jnp.where(people.robot >= 0, lag, 0.0)
+        wait = jnp.where(comes, pause, jnp.maximum(people.wait - 1.0, 0.0))
+        helper = helper_of(plan.humans, n)
+        given = plan.teleoperated & (wait < 1.0)[helper]
+        steps = jnp.round(delay).astype(jnp.int32)[helper]
+        seen = jnp.concatenate([action[:, None], people.past.values], axis=1)
+        done = jnp.take_along_axis(seen, steps[:, None, None], axis=1)[:, 0]
+        deviation = (noise * tired)[helper][:, None]
+        if not spec.discrete:
+            noisy = jnp.clip(done + deviation * jax.random.normal(key_noise, done.shape), -1.0, 1.0)
+            done = jnp.where(deviation > 0, noisy, done)
+        wrong = jax.random.uniform(key_whether, (n,)) < mistakes[helper]
+        done = jnp.where(wrong[:, None], _any_action(spec, n, key_what), done)
+        leaves = absence / jnp.maximum((1.0 - absence) * absence_time, 1e-6)
+        chance = jax.random.uniform(key_away, (m,))
+        away = jnp.where(people.away, chance >= 1.0 / absence_time, chance < leaves)
+        busy = people.busy + ((robot >= 0).astype(jnp.float32) - people.busy) / TIRING
+        past = PerRobot(seen[:, :LONGEST_DELAY])
+        return People(robot, wait, busy, away, past), jnp.where(given[:, None], done, action), given
+
+    return HumanModel(init, available, act)
+
+
+def _any_action(spec: EnvSpec, number: int, key: jax.Array) -> jax.Array:
+    if spec.discrete:
+        return jax.nn.one_hot(jax.random.randint(key, (number,), 0, spec.action_size), spec.action_size)
+    return jax.random.uniform(key, (number, spec.action_size), minval=-1.0)
+
+
+class Links(NamedTuple):
+    """The robots' connections to the humans.
+
+    Attributes:
+        init: `key -> bool[N]`, which links work at t = 0.
+        quality: `(works bool[N], timestep i32[]) -> f32[N]`, the chance that each works at this timestep: `Signals.link`.
+    """
+
+    init: Callable[[jax.Array], jax.Array]
+    quality: Callable[[jax.Array, jax.Array], jax.Array]
+
+
+def draw(quality: jax.Array, key: jax.Array) -> jax.Array:
+    """Return bool[N], which links work at a timestep; over one that does not, no action of a human arrives."""
+    return jax.random.uniform(key, quality.shape) < quality
+
+
+def make_gilbert_elliott(config: Any) -> Links:
+    """Links that fail with `link_failure_rate` b and are repaired with `link_repair_rate` a, at each timestep.
+
+    In the long run a share b / (a + b) of them does not work.
+
+    Reference: Gilbert, Capacity of a burst-noise channel, 1960; Elliott, 1963.
+    """
+    failure, repair = config.link_failure_rate, config.link_repair_rate
+
+    def init(key: jax.Array) -> jax.Array:
+        return jax.random.uniform(key, (config.num_robots,)) >= failure / jnp.maximum(failure + repair, 1e-9)
+
+    return Links(init, lambda works, timestep: jnp.where(works, 1.0 - failure, repair))
+
+
+POOR, GOOD, POOR_SHARE = 0.2, 0.9, 0.7  # chances that links work, and the share of robots with poor ones
+SWAP_BEGINS, SWAP_ENDS = 0.2, 0.8  # shares of the run
+
+
+def make_unequal(config: Any) -> Links:
+    """Links of which the first 70 % work with chance 0.2, the others with 0.9, at each timestep.
+
+    Reference: the static scenario of ASA's published code (Fleet-Supervisor-Allocation).
+    """
+    chance = jnp.where(jnp.arange(config.num_robots) < round(POOR_SHARE * config.num_robots), POOR, GOOD)
+    return Links(lambda key: draw(chance, key), lambda works, timestep: chance.astype(jnp.float32))
+
+
+def make_swapping(config: Any) -> Links:
+    """Links as `make_unequal` has them, whose chances change over to each other's between 20 % and 80 % of the run, linearly.
+
+    Reference: the changing scenario of ASA's published code (Fleet-Supervisor-Allocation).
+    """
+    chance = make_unequal(config).quality(jnp.zeros(0), jnp.int32(0))
+
+    def quality(works: jax.Array, timestep: jax.Array) -> jax.Array:
+        del works
+        done = timestep.astype(jnp.float32) / config.num_steps
+        share = jnp.clip((done - SWAP_BEGINS) / (SWAP_ENDS - SWAP_BEGINS), 0.0, 1.0)
+        return chance + share * (POOR + GOOD - 2.0 * chance)
+
+    return Links(lambda key: draw(chance, key), quality)
+
+
+# Each is `(config, EnvSpec) -> HumanModel`; None = a perfect human, who needs no model.
+HUMAN_MODELS: Registry[Callable[[Any, EnvSpec], HumanModel] | None] = Registry("human_model")
+for _name, _make in {"perfect": None, "imperfect": make_imperfect}.items():
+    HUMAN_MODELS.register(_name, _make)
+
+# Each is `config -> Links`; None = links that always work.
+LINK_MODELS: Registry[Callable[[Any], Links] | None] = Registry("link_model")
+_LINKS = {"perfect": None, "gilbert_elliott": make_gilbert_elliott, "unequal": make_unequal, "swapping": make_swapping}
+for _name, _make_links in _LINKS.items():
+    LINK_MODELS.register(_name, _make_links)
+
+
+def register_human_model(name: str, make: Callable[[Any, EnvSpec], HumanModel]) -> None:
+    """Make a human model available as `human_model = name`.
+
+    Args:
+        name: what `make_config` calls it.
+        make: `(config, EnvSpec) -> HumanModel`.
+
+    Raises:
+        ValueError: if the name is taken.
+    """
+    HUMAN_MODELS.register(name, make)
+
+
+__all__ = ["HUMAN_MODELS", "LINK_MODELS", "HumanModel", "Links", "register_human_model"]

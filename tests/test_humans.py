@@ -1,0 +1,282 @@
+"""Imperfect people and links: each effect alone, and nothing where all are neutral."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import compiled
+
+import fleetjax
+from fleetjax import envs, humans
+from fleetjax.config import validate
+from fleetjax.fleet import make_fleet, make_parts, plan
+from fleetjax.io import plain
+from fleetjax.keys import split_keys
+from fleetjax.types import HumanState, Plan
+
+N, M, A = 6, 3, 2
+SMALL = {"num_robots": 20, "num_humans": 4, "num_steps": 80, "initial_period": 5, "pretraining_steps": 30}
+SPEC = envs.make("navigation").spec
+quick_run = compiled(fleetjax.run)
+
+
+def model(**parameters):
+    """Return a model of three humans over six robots, and what it carries at t = 0."""
+    config = fleetjax.make_config("navigation", num_robots=N, num_humans=M, human_model="imperfect", **parameters)
+    found = humans.HUMAN_MODELS.get("imperfect")(config, SPEC)
+    return found, found.init(config, jax.random.key(0))
+
+
+def planned(*robots: int) -> Plan:
+    """Return a plan in which the humans teleoperate these robots, -1 = none."""
+    robot = jnp.array(robots, jnp.int32)
+    teleoperated = jnp.zeros(N, bool).at[jnp.where(robot >= 0, robot, N)].set(True, mode="drop")
+    crew = HumanState(robot, jnp.zeros(M, jnp.int32))
+    return Plan(None, jnp.zeros((N, A)), jnp.zeros(N), crew, teleoperated, jnp.zeros(N, bool))
+
+
+def follow(found, aux, plans, actions=None):
+    """Return actions [T, N, A] and given [T, N] of consecutive timesteps."""
+    done, given, act = [], [], compiled(found.act)
+    for t, one in enumerate(plans):
+        action = jnp.full((N, A), 0.5) if actions is None else actions[t]
+        aux, did, really = act(aux, one, action, jax.random.key(t))
+        done.append(np.asarray(did))
+        given.append(np.asarray(really))
+    return np.stack(done), np.stack(given), aux
+
+
+@functools.cache
+def result_of(**parameters):
+    return quick_run(fleetjax.make_config("navigation", **SMALL | parameters), jax.random.key(0))
+
+
+def assert_same(one, other):
+    jax.tree.map(np.testing.assert_array_equal, one, other)
+
+
+def test_neutral_people_do_what_perfect_ones_do():
+    """From the same state; whole runs are other programs, which round differently."""
+    perfect = fleetjax.make_config("navigation", **SMALL)
+    neutral, env = perfect.replace(human_model="imperfect"), envs.make("navigation")
+    state = result_of(num_steps=40).state
+    steps = [compiled(make_fleet(config, env).step) for config in (perfect, neutral)]
+    people = humans.make_imperfect(neutral, SPEC).init(neutral, jax.random.key(0))._replace(robot=state.humans.robot)
+    taught = 0
+    for t in range(6):
+        key = jax.random.key(t)
+        (one, counts), (other, others) = steps[0](state, key), steps[1](state._replace(people=people), key)
+        for count, other_count in zip(counts, others, strict=True):
+            np.testing.assert_allclose(count, other_count, rtol=1e-3)
+        assert_same(one.humans, other.humans)
+        rows = one.human_data.pairs.size
+        jax.tree.map(
+            lambda x, y, n=rows: np.testing.assert_allclose(x[:n], y[:n], atol=1e-5),
+            one.human_data.pairs.rows,
+            other.human_data.pairs.rows,
+        )
+        taught += int(rows) - int(state.human_data.pairs.size)
+        state, people = one, other.people
+    assert taught > 6
+
+
+@pytest.mark.parametrize("name", [name for name in humans.HUMAN_MODELS.names() if humans.HUMAN_MODELS.get(name)])
+def test_every_model_keeps_shapes_and_gives_only_where_humans_teleoperate(name):
+    config = fleetjax.make_config("navigation", num_robots=N, num_humans=M, human_model=name)
+    found = humans.HUMAN_MODELS.get(name)(config, SPEC)
+    aux = found.init(config, jax.random.key(0))
+    there = found.available(aux, jax.random.key(1))
+    assert (there.shape, there.dtype) == ((M,), jnp.bool_)
+    one = planned(4, -1, 0)
+    after, action, given = found.act(aux, one, jnp.ones((N, A)), jax.random.key(2))
+    shapes = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype), tree)  # noqa: E731
+    assert shapes(after) == shapes(aux)
+    assert (action.shape, given.shape, given.dtype) == ((N, A), (N,), jnp.bool_)
+    assert not np.any(given & ~one.teleoperated)
+
+
+def test_takeover_times_are_lognormal_with_a_deviation_in_proportion_to_the_mean():
+    mean = jnp.repeat(jnp.array([2.0, 10.0]), 100_000)
+    times = np.asarray(humans.takeover_times(mean, jnp.full(mean.shape, 0.5), jax.random.key(0))).reshape(2, -1)
+    np.testing.assert_allclose(times.mean(axis=1), [2, 10], rtol=0.01)
+    np.testing.assert_allclose(times.std(axis=1), [1, 5], rtol=0.03)
+    logs = np.log(times[0])
+    assert abs(np.mean((logs - logs.mean()) ** 3) / logs.std() ** 3) < 0.05
+
+
+def test_a_human_acts_only_after_the_takeover_and_later_from_another_robot():
+    found, aux = model(takeover_time=3.0, takeover_spread=0.0, switching_lag=2.0)
+    plans = [planned(0, -1, -1)] * 6 + [planned(2, -1, -1)] * 8
+    _, given, _ = follow(found, aux, plans)
+    assert given[:, 0].tolist() == [False] * 3 + [True] * 3 + [False] * 8
+    assert given[:, 2].tolist() == [False] * 6 + [False] * 5 + [True] * 3
+
+
+def test_values_for_each_human_act_on_that_human():
+    found, aux = model(takeover_time=(0.0, 2.0, 4.0), takeover_spread=0.0)
+    _, given, _ = follow(found, aux, [planned(5, 3, 1)] * 6)
+    assert [int(np.argmax(given[:, robot])) for robot in (5, 3, 1)] == [0, 2, 4]
+
+
+def test_a_late_action_is_that_of_some_timesteps_ago():
+    found, aux = model(action_delay=(0.0, 3.0, 10.0))
+    actions = [jnp.full((N, A), t / 100) for t in range(15)]
+    done, given, _ = follow(found, aux, [planned(0, 1, 2)] * 15, actions)
+    assert np.all(given[:, :3])
+    for robot, late in ((0, 0), (1, 3), (2, 10)):
+        np.testing.assert_allclose(done[late:, robot, 0], np.arange(15 - late) / 100, rtol=1e-6)
+
+
+def test_noise_and_mistakes():
+    found, aux = model(action_noise=(0.1, 0.0, 0.0), mistake_rate=(0.0, 0.3, 0.0))
+    done, _, _ = follow(found, aux, [planned(0, 1, 2)] * 400, [jnp.zeros((N, A))] * 400)
+    assert done[:, 0].std() == pytest.approx(0.1, rel=0.15)
+    assert np.mean(np.any(done[:, 1] != 0, axis=-1)) == pytest.approx(0.3, abs=0.1)
+    assert np.abs(done[:, 1]).max() > 0.8
+    assert not np.any(done[:, 2:])
+
+
+def test_fatigue_grows_with_work_and_lengthens_takeovers():
+    found, aux = model(fatigue=1.0, takeover_time=4.0, takeover_spread=0.0)
+    _, given, fresh = follow(found, aux, [planned(0, -1, -1)] * 200)
+    assert np.argmax(given[:, 0]) == 4
+    np.testing.assert_allclose(fresh.busy, [1 - (1 - 1 / humans.TIRING) ** 200, 0, 0], rtol=1e-4)
+    tired = fresh._replace(busy=jnp.ones(M))
+    _, given, _ = follow(found, tired, [planned(1, -1, -1)] * 12)
+    assert np.argmax(given[:, 1]) == 8
+
+
+def test_absence_is_a_share_of_the_time_in_spells_of_a_mean_length():
+    found, aux = model(absence=(0.0, 0.3, 0.8), absence_time=10.0)
+    one = planned(-1, -1, -1)
+
+    def step(aux, key):
+        aux = found.act(aux, one, jnp.zeros((N, A)), key)[0]
+        return aux, ~found.available(aux, key)
+
+    away = np.asarray(
+        jax.jit(lambda aux, keys: jax.lax.scan(step, aux, keys)[1])(aux, jax.random.split(jax.random.key(1), 20_000))
+    )
+    np.testing.assert_allclose(away.mean(axis=0), [0, 0.3, 0.8], atol=0.05)
+    ends = np.sum(away[:-1] & ~away[1:], axis=0)[1:]
+    np.testing.assert_allclose(away.sum(axis=0)[1:] / ends, 10, rtol=0.15)
+
+
+def test_nobody_who_is_away_helps():
+    config = fleetjax.make_config("navigation", absence=0.9, absence_time=20.0, **SMALL)
+    fleet, state = make_fleet(config, envs.make("navigation")), fleetjax.prepare(config, jax.random.key(0))
+    parts, step = make_parts(config, envs.make("navigation")), compiled(fleet.step)
+    seen = 0
+    for t in range(30):
+        state, _ = step(state, jax.random.key(t))
+        away = np.asarray(state.people.away)
+        _, next_plan = plan(parts, state, split_keys(jax.random.key(t + 1), 20), jnp.asarray(~away))
+        assert np.all(np.asarray(next_plan.humans.robot)[away] < 0)
+        seen += away.sum()
+    assert seen > 30
+
+
+@pytest.mark.parametrize("works", [True, False])
+def test_gilbert_and_elliotts_links(works):
+    config = fleetjax.make_config(
+        "navigation", num_robots=400, link_model="gilbert_elliott", link_failure_rate=0.1, link_repair_rate=0.3
+    )
+    links = humans.LINK_MODELS.get("gilbert_elliott")(config)
+    state = links.init(jax.random.key(0))
+    assert np.mean(state) == pytest.approx(0.75, abs=0.1)
+    np.testing.assert_allclose(links.quality(jnp.full(400, works), jnp.int32(0)), 0.9 if works else 0.3, rtol=1e-6)
+    up = []
+    for t in range(300):
+        state = humans.draw(links.quality(state, jnp.int32(t)), jax.random.key(t))
+        up.append(np.asarray(state))
+    assert np.mean(up) == pytest.approx(0.3 / 0.4, abs=0.02)
+
+
+def test_the_scenarios_of_unequal_links():
+    config = fleetjax.make_config("navigation", num_robots=10, num_steps=100, link_model="swapping")
+    for t, poor, good in ((0, 0.2, 0.9), (20, 0.2, 0.9), (50, 0.55, 0.55), (80, 0.9, 0.2), (99, 0.9, 0.2)):
+        chance = humans.LINK_MODELS.get("swapping")(config).quality(jnp.ones(10, bool), jnp.int32(t))
+        np.testing.assert_allclose(chance, [poor] * 7 + [good] * 3, rtol=1e-5)
+    chance = humans.LINK_MODELS.get("unequal")(config).quality(jnp.ones(10, bool), jnp.int32(99))
+    np.testing.assert_allclose(chance, [0.2] * 7 + [0.9] * 3, rtol=1e-6)
+
+
+def test_no_action_arrives_over_a_link_that_does_not_work():
+    """With links that never work, nothing is taught; violations are still reset."""
+    result = result_of(link_model="gilbert_elliott", link_failure_rate=1.0, link_repair_rate=0.0)
+    perfect = result_of()
+    assert int(result.state.human_data.pairs.size) == 500  # the demonstrations
+    assert int(perfect.state.human_data.pairs.size) > 600
+    assert np.sum(result.metrics.human_steps) > 0
+
+
+IMPERFECT = {
+    "takeover_time": 2.0,
+    "action_noise": 0.1,
+    "mistake_rate": 0.05,
+    "fatigue": 0.5,
+    "absence": 0.2,
+    "action_delay": 2.0,
+}
+
+
+def test_runs_with_imperfect_people_go_on_from_a_state():
+    config = fleetjax.make_config("navigation", link_model="unequal", **SMALL | IMPERFECT)
+    start = compiled(fleetjax.prepare)(config, jax.random.key(0))
+    whole = quick_run(config, jax.random.key(0), start)
+    half = config.replace(num_steps=40, human_capacity=config.human_capacity)
+    first = quick_run(half, jax.random.key(0), start)
+    second = quick_run(half, jax.random.key(0), first.state)
+    assert_same(whole.metrics.successes, jnp.concatenate([first.metrics.successes, second.metrics.successes]))
+    assert_same(whole.state.people, second.state.people)
+    assert np.sum(whole.metrics.human_steps) > 0
+
+
+def test_values_sweep_without_compiling_again():
+    config = fleetjax.make_config("navigation", **SMALL | IMPERFECT)
+    run = jax.jit(fleetjax.run, compiler_options={"xla_backend_optimization_level": 0})
+    for time in (1.0, 4.0):
+        run(config.replace(takeover_time=time), jax.random.key(0))
+    assert run._cache_size() == 1
+    swept = jax.vmap(lambda x: config.replace(takeover_time=x))(jnp.array([1.0, 40.0]))
+    quick, slow = jax.vmap(lambda c: fleetjax.run(c, jax.random.key(0)).state.human_data.pairs.size)(swept)
+    assert int(quick) > int(slow)
+
+
+def test_parameters_choose_the_model():
+    assert fleetjax.make_config("navigation").human_model == "perfect"
+    assert fleetjax.make_config("navigation", takeover_time=2.0).human_model == "imperfect"
+
+
+def test_values_for_each_human_are_written_and_read():
+    config = fleetjax.make_config("navigation", num_humans=2, action_noise=(0.1, 0.2))
+    again = plain.from_plain(plain.to_plain(config))
+    assert plain.to_plain(config)["action_noise"] == [0.1, 0.2]
+    assert_same(again.action_noise, config.action_noise)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        (
+            {"action_noise": (0.1, 0.2)},
+            "action_noise has 2 values for num_humans = 10; give one for each human, or one for all",
+        ),
+        ({"action_noise": (0.1,) * 9 + (-0.1,)}, "action_noise = -0.1.* must be at least 0"),
+        ({"absence": 1.0}, "absence = 1.0 must be in"),
+        ({"action_delay": 11.0}, "action_delay = 11.0 must be in"),
+        ({"human_model": "imperfet"}, "human_model = 'imperfet' is unknown; the closest are imperfect"),
+        ({"link_model": "good"}, "link_model = 'good' is unknown"),
+        ({"human_model": "perfect", "fatigue": 1.0}, "fatigue has no effect with human_model = 'perfect'; also pass"),
+    ],
+)
+def test_bad_input_is_refused(parameters, message):
+    with pytest.raises(ValueError, match=message):
+        fleetjax.make_config("navigation", **parameters)
+
+
+def test_a_changed_configuration_is_checked():
+    with pytest.raises(ValueError, match="takeover_time has no effect"):
+        validate(fleetjax.make_config("navigation").replace(takeover_time=2.0))

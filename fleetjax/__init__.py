@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from fleetjax.field import Field
     from fleetjax.fleet import Fleet, FleetState, make_fleet
     from fleetjax.gradients import Sensitivity, sensitivity
+    from fleetjax.humans import HumanModel, register_human_model
     from fleetjax.io.animation import Animation, animate
     from fleetjax.io.comparing import compare
     from fleetjax.io.comparison import Comparison
@@ -41,6 +42,7 @@ __all__ = [
     "Field",
     "Fleet",
     "FleetState",
+    "HumanModel",
     "HumanState",
     "Interventions",
     "Metrics",
@@ -70,6 +72,7 @@ __all__ = [
     "register_algorithm",
     "register_env",
     "register_estimator",
+    "register_human_model",
     "register_priority",
     "register_supervisor",
     "rohe",
@@ -95,6 +98,7 @@ _NAMES = {
     "io.comparing": ["compare"],
     "io.comparison": ["Comparison"],
     "io.figure": ["plot"],
+    "humans": ["HumanModel", "register_human_model"],
     "learning.estimator": ["Estimator", "Step"],
     "learning.estimators": ["register_estimator"],
     "metrics": ["Metrics", "first_divergence", "rohe"],

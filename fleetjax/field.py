@@ -115,19 +115,17 @@ class Fields:
     goal_discount: float = _traced(0.999, "discount of the goal critic", high=1)
     target_rate: float = _traced(2e-4, "rate at which target networks follow, per gradient step", high=1)
 
-    action_noise: float = _of_humans(0.0, "humans: standard deviation of the noise on their actions")
-    mistake_rate: float = _of_humans(0.0, "humans: chance of a random action", high=1)
-    takeover_time: float = _of_humans(0.0, "humans: mean time from their assignment to their first action", "timesteps")
-    takeover_spread: float = _of_humans(0.5, "humans: standard deviation of that time, as a share of its mean")
-    action_delay: float = _of_humans(0.0, "humans: time by which their actions are late", "timesteps", high=10)
-    switching_lag: float = _of_humans(0.0, "humans: further time if they come from another robot", "timesteps")
-    fatigue: float = _of_humans(0.0, "humans: growth of takeover time and noise for one who is always busy, as a share")
-    absence: float = _of_humans(0.0, "humans: share of the time in which they are away", high=0.99)
-    absence_time: float = _of_humans(100.0, "humans: mean time for which they are away", "timesteps", low=1)
-    link_failure_rate: float = _traced(0.01, "links, gilbert_elliott: chance that one that works fails, per timestep", high=1)
-    link_repair_rate: float = _traced(
-        0.1, "links, gilbert_elliott: chance that one that failed is repaired, per timestep", high=1
-    )
+    action_noise: float = _of_humans(0.0, "standard deviation of the noise on their actions")
+    mistake_rate: float = _of_humans(0.0, "chance of a random action", high=1)
+    takeover_time: float = _of_humans(0.0, "mean time from their assignment to their first action", "timesteps")
+    takeover_spread: float = _of_humans(0.5, "standard deviation of that time, as a share of its mean")
+    action_delay: float = _of_humans(0.0, "time by which their actions are late", "timesteps", high=10)
+    switching_lag: float = _of_humans(0.0, "further time if they come from another robot", "timesteps")
+    fatigue: float = _of_humans(0.0, "growth of takeover time and noise for one who is always busy, as a share")
+    absence: float = _of_humans(0.0, "share of the time in which they are away", high=0.99)
+    absence_time: float = _of_humans(100.0, "mean time for which they are away", "timesteps", low=1)
+    link_failure_rate: float = _traced(0.01, "gilbert_elliott: chance that one that works fails, per timestep", high=1)
+    link_repair_rate: float = _traced(0.1, "gilbert_elliott: chance that one that failed is repaired, per timestep", high=1)
 
 
 FIELDS: dict[str, Field] = {f.name: f.metadata["field"] for f in dataclasses.fields(Fields)}
@@ -135,6 +133,7 @@ FIELDS: dict[str, Field] = {f.name: f.metadata["field"] for f in dataclasses.fie
 # What only the imperfect human model has, and makes no difference at its default or alone.
 OF_HUMANS = tuple(name for name, field in FIELDS.items() if field.per_human)
 SHAPES_OF_HUMANS = ("takeover_spread", "absence_time")
+OF_LINKS = ("link_failure_rate", "link_repair_rate")
 
 # What acts only before the fleet starts.
 OFFLINE = (

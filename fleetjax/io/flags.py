@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import Any, NoReturn
 
 from fleetjax.environments import get_defaults, list_envs
-from fleetjax.field import FIELDS, Field, every_field, owners_in_words
+from fleetjax.field import FIELDS, OF_LINKS, Field, every_field, owners_in_words
 from fleetjax.io.errors import Refusal
 from fleetjax.io.formats import FORMATS
 from fleetjax.io.lists import listed, sizes
@@ -322,10 +322,17 @@ def _add_parameters(
     """Add a flag for each field of `Config`, with a short form for some, and for each parameter of an algorithm."""
     add = _add_list if with_lists else _add_field
     fields = command.add_argument_group(f"parameters{f' (defaults of {environment})' if environment else ''}")
+    people = command.add_argument_group("humans and links (@FILE: a number for each human)")
     own = command.add_argument_group("parameters of one algorithm each")
     for name, field in every_field().items():
         if name in FIELDS and name != "environment":
-            add(fields, name, field, environment, *([short[name]] if name in short else []))
+            add(
+                people if field.per_human or name in OF_LINKS else fields,
+                name,
+                field,
+                environment,
+                *([short[name]] if name in short else []),
+            )
         elif name not in FIELDS:
             add(own, name, field._replace(help=f"{owners_in_words(name)}: {field.help}"), environment)
 
@@ -337,7 +344,7 @@ def _add_field(group: Any, name: str, field: Field, environment: str | None, *sh
     elif field.kind is tuple:
         options |= {"type": _integer, "nargs": "+", "metavar": "N"}
     else:
-        options["type"], options["metavar"] = _KINDS[field.kind]
+        options["type"], options["metavar"] = _reader(field)
     group.add_argument(_flag(name), *short, **options)
 
 
@@ -347,7 +354,7 @@ def _add_list(group: Any, name: str, field: Field, environment: str | None) -> N
     if field.kind is tuple:
         options |= {"action": sizes(_integer), "nargs": "+", "metavar": "N"}
     else:
-        read, letter = _KINDS[field.kind]
+        read, letter = _reader(field)
         options |= {"type": listed(read), "metavar": f"{letter},..."}
     if field.kind is bool:
         options |= {"nargs": "?", "const": [True]}
@@ -415,6 +422,11 @@ def _seed(text: str) -> int:
     if not text.isascii() or not text.isdecimal() or int(text) > LARGEST_SEED:
         raise argparse.ArgumentTypeError(f"{text!r} must be a whole number from 0 to {LARGEST_SEED}")
     return int(text)
+
+
+def _reader(field: Field) -> tuple[Any, str]:
+    """Return what reads a field's value, and what stands for it in the help."""
+    return (_number_or_file, "X|@FILE") if field.per_human else _KINDS[field.kind]
 
 
 _KINDS = {  # what reads a value, and what stands for it in the help

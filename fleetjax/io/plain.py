@@ -7,17 +7,11 @@ from typing import Any
 import numpy as np
 
 from fleetjax.config import Config, all_fields, get_value, validate
-from fleetjax.field import KINDS, OF_HUMANS, Field
+from fleetjax.field import KINDS, OF_HUMANS, OF_LINKS, Field
 from fleetjax.io.files import expect
 
-_LINKS = ("link_model", "link_failure_rate", "link_repair_rate")
-_LATER = (
-    "allocation",
-    "temperature",
-    "human_model",
-    *OF_HUMANS,
-    *_LINKS,
-)  # fields that came later; their defaults are what was done before
+# Fields that came later; their defaults are what was done before.
+_LATER = ("allocation", "temperature", "human_model", "link_model", *OF_HUMANS, *OF_LINKS)
 _LARGEST = 2**31 - 1  # traced integers are i32
 
 

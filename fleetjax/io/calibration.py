@@ -57,8 +57,10 @@ class Calibration(NamedTuple):
 
 
 def default_field(config: Config) -> str:
-    """Return the threshold by which an algorithm asks for help: its own, if it has one."""
-    return next((name for name in config.parameters if name.endswith("_threshold")), "uncertainty_threshold")
+    """Return the threshold, or the rate, by which an algorithm asks for help: its own, if it has one."""
+    endings = ("_threshold", "_rate")
+    own = [name for ending in endings for name in config.parameters if name.endswith(ending)]
+    return own[0] if own else "uncertainty_threshold"
 
 
 def check(request: Request) -> None:

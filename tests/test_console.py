@@ -608,3 +608,21 @@ def knock(port: int) -> None:
     """Wait until the console answers."""
     with connect(f"ws://127.0.0.1:{port}/ws/fleet", origin=f"http://127.0.0.1:{port}", proxy=None) as page:  # type: ignore[arg-type]
         hear(page, "waiting")
+
+
+def test_the_fleets_page_says_when_resets_begin():
+    config = fleetjax.make_config("navigation", "cur", initial_period=50)
+    assert [pages._resets_begin(config, t) for t in (0, 49, 50)] == [50, 50, -1]
+    uncertain_first = fleetjax.make_config("navigation", "ensemble_dagger", initial_period=50)
+    assert pages._resets_begin(uncertain_first, 0) == -1
+
+
+@pytest.mark.parametrize(("given", "period"), [([], 0), (["--initial-period", "7"], 7)])
+def test_a_console_has_no_initial_period_unless_asked_for(given, period):
+    from fleetjax.io import commands
+    from fleetjax.io import flags as command_line
+
+    arguments = command_line.parse(["console", "navigation", *given])
+    assert int(commands._config(arguments, commands._parameters(arguments)).initial_period) == period
+    arguments = command_line.parse(["run", "navigation"])
+    assert int(commands._config(arguments, commands._parameters(arguments)).initial_period) == 500

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from fleetjax.config import Config
 from fleetjax.console.controls import controls_of
 from fleetjax.console.engine import EMPTY, PERSON, View
 from fleetjax.console.seats import Seat
 from fleetjax.console.session import Session
+from fleetjax.field import ORDERS_WITH_C
 from fleetjax.io import text
 from fleetjax.priority import get_algorithm
 from fleetjax.types import EnvState
@@ -167,6 +169,7 @@ def fleet(
     return {
         "type": "fleet",
         "tick": view.timestep,
+        "resets_begin": _resets_begin(session.config, view.timestep),
         "robots": robots,
         "seats": seats,
         "people": int(np.sum(kinds == PERSON)),
@@ -175,3 +178,10 @@ def fleet(
         "places": places,
         "curves": curves,
     }
+
+
+def _resets_begin(config: Config, timestep: int) -> int:
+    """Return the timestep before which robots in violation wait, -1 if it has come."""
+    waits = config.algorithm in (*ORDERS_WITH_C, "weighted", "asa")
+    begins = int(config.initial_period)
+    return begins if waits and timestep < begins else -1

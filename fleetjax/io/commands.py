@@ -123,6 +123,8 @@ def _config(arguments: argparse.Namespace, given: Mapping[str, Any]) -> Config:
         resume = ", or resume a run with --resume RUN" if arguments.command == "run" else ""
         raise ValueError(f"ENV is missing; choose one of {', '.join(known)}{resume}")
     overrides = {name: value for name, value in given.items() if name not in ("environment", "algorithm")}
+    if arguments.command == "console":  # a person who is free is asked at once
+        overrides = {"initial_period": 0} | overrides
     config = make_config(given["environment"], given.get("algorithm", "cur"), **overrides)
     check_run(config)
     return config

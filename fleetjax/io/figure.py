@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
@@ -231,7 +232,7 @@ def _styles(groups: Sequence[Curves]) -> list[tuple[str, Any]]:
         own = labels[curves.algorithm]
         place = own.index(curves.label)
         many = len(own) > len(_DASHES)
-        shade = mpl.colors.to_hex(mpl.colormaps["viridis"](0.92 * place / max(len(own) - 1, 1)))
+        shade = to_hex(mpl.colormaps["viridis"](0.92 * place / max(len(own) - 1, 1)))
         return shade if many else colours[curves.algorithm], _DASHES[place % len(_DASHES)]
 
     return [style_of(curves) for curves in groups]

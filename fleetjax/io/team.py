@@ -88,8 +88,10 @@ def _leave_last() -> None:
 
 
 def _wait_for_the_others() -> None:
+    store = distributed.global_state.client
     with contextlib.suppress(jax.errors.JaxRuntimeError):
-        distributed.global_state.client.get_live_nodes(list(range(jax.process_count())))  # answers as soon as they do, or left
+        if store is not None:
+            store.get_live_nodes(list(range(jax.process_count())))  # answers as soon as all others ask as well, or have left
 
 
 def _knock(host: str, port: int, timeout: int) -> None:

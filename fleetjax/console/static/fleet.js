@@ -85,7 +85,8 @@ function showRobot(robot, i, message) {
   if (data) picture.src = data;
   picture.hidden = !data;
   const helped = robot.helper >= 0;
-  const alone = robot.violation ? "stuck, waits" : "by itself";
+  const waiting = message.resets_begin < 0 ? "stuck, waits" : `stuck; resets begin at timestep ${message.resets_begin}`;
+  const alone = robot.violation ? waiting : "by itself";
   const waits = helped && message.seats[robot.helper].waits;
   const help = waits ? `waits for R from seat ${robot.helper + 1}` : `seat ${robot.helper + 1} ${robot.violation ? "resets" : "helps"}`;
   const does = helped ? help : alone;

@@ -207,7 +207,7 @@ PARAMETERS: dict[str, Mapping[str, Field]] = {
     "aim": {"aim_rate": Field("share of robots at each timestep that may ask", high=1, default=0.05)},
     "iifl": {"iifl_rate": Field("share of robots at each timestep that may ask", high=1, default=0.001)},
     "round_robin": {
-        "round_robin_threshold": Field("time without help up to which no robot is served", "timesteps", default=0.0),
+        "round_robin_threshold": Field("time without help up to which no robot is served", "timesteps", default=100.0),
     },
     "whittle": {
         "whittle_threshold": Field("index, as worth of a timestep of help, at or below which no robot is helped", default=0.1),

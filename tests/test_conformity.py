@@ -278,7 +278,7 @@ def jitted(name):
 
 def settings_of(name):
     """Return settings in which every rule helps somebody."""
-    lower = {"random_threshold": 0.4, "thrifty_threshold": 0.5}
+    lower = {"random_threshold": 0.4, "thrifty_threshold": 0.5, "round_robin_threshold": 5.0}
     own = priority.get_algorithm(name).parameters
     config = fleetjax.make_config("navigation", initial_period=50, num_robots=24, num_humans=6)
     return config.replace(algorithm=name, **{field: value for field, value in lower.items() if field in own})

@@ -482,9 +482,9 @@ def test_a_run_that_fails_is_told_and_the_others_go_on(tmp_path, spawn, whole):
 
 
 @pytest.mark.slow
-def test_kills_of_workers_and_of_all_lose_nothing(tmp_path, spawn, whole):
+def test_kills_of_workers_and_of_all_lose_nothing(tmp_path, spawn, whole_long):
     output = tmp_path / "out"
-    command = ("sweep", "navigation", *RANDOM, "--seeds", 3, "--workers", 2, "--output", output)
+    command = ("sweep", "navigation", *RANDOM, "--num-steps", LONG, "--seeds", 3, "--workers", 2, "--output", output)
     process = spawn(*command)
     with contextlib.ExitStack() as stack:
         stack.callback(process.kill)
@@ -494,7 +494,7 @@ def test_kills_of_workers_and_of_all_lose_nothing(tmp_path, spawn, whole):
         process.kill()
         process.communicate()
         wait_for_end(workers)
-        assert 200 < rows(the_run(output, 0)) < STEPS
+        assert 200 < rows(the_run(output, 0)) < LONG
 
         process = spawn(*command)
         stack.callback(process.kill)
@@ -508,7 +508,7 @@ def test_kills_of_workers_and_of_all_lose_nothing(tmp_path, spawn, whole):
 
     code, _, said = end(spawn(*command))
     assert (code, said[0]) == (0, "3 runs, 2 of them finished already")
-    assert [results(the_run(output, seed)) for seed in range(3)] == [whole[seed] for seed in range(3)]
+    assert [results(the_run(output, seed)) for seed in range(3)] == [whole_long[seed] for seed in range(3)]
     for seed in (0, 2):
         assert "resuming from" in (output / "logs" / f"navigation-random-seed{seed}.log").read_text()
 

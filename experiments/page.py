@@ -6,7 +6,7 @@ A table stands between `<!-- NAME -->` and `<!-- end -->`, where NAME is one of:
 
 - a part of the study, such as `main`: what the algorithms achieved in it, each robot's one after the other.
 - `claims`: the verdicts of `claims.py`.
-- `missing`: how many runs of each part are stored, of how many.
+- `missing`: how many runs of each part are stored, of how many, and what they ran on.
 """
 
 import argparse
@@ -19,7 +19,7 @@ import numpy as np
 import paper
 
 from fleetjax.io import comparing, files, rows, text
-from fleetjax.io.outcomes import Group, group
+from fleetjax.io.outcomes import Group, Outcome, group
 from fleetjax.io.study import plan
 
 PUBLISHED = {  # successes of the trained policies (paper, Appendix); Fleet-TD is the hand's only
@@ -35,6 +35,18 @@ PUBLISHED = {  # successes of the trained policies (paper, Appendix); Fleet-TD i
     },
 }
 COLUMNS = {"successes": "successes", "violations": "violations", "human_steps": "human time", "rohe": "ROHE"}
+
+
+def readable(label: str) -> str:
+    """Return the label of a group in words.
+
+    >>> readable("C.U.R., min_teleop_time 5, idle_humans_teleoperate True, tired False")
+    'C.U.R., t_T = 5, idle humans teleoperate'
+    """
+    label = re.sub(r", \w+ False|(?<=\w) True", "", label)
+    for name, short in claims.NAMES.items():
+        label = re.sub(rf"\b{name} ", f"{short} = ", label)
+    return label.replace("_", " ")
 
 
 def mean(one: Group, metric: str, *, spread: bool = False) -> str:
@@ -53,14 +65,15 @@ def achieved(found: list[Group], alone: Mapping[str, Group]) -> str:
     table = [tuple(head + policies)]
     for one in sorted(found, key=lambda one: [*claims.NAMES].index(one.config.environment)):
         place, algorithm = one.config.environment, one.config.algorithm
-        cells = [f"{claims.NAMES[place]}, {one.label}", str(len(one.runs))]
+        cells = [f"{claims.NAMES[place]}, {readable(one.label)}", str(len(one.runs))]
         cells += [mean(one, metric, spread=metric == "successes") for metric in columns]
         if counted:
             cells += [mean(one, "rohe_with_demonstrations") if "constraint" in algorithm else ""]
         if alone:
             policy = alone.get(f"{place} {one.label}")
             paper_value = PUBLISHED.get(place, {}).get(algorithm)
-            cells += [mean(policy, "successes"), mean(policy, "violations")] if policy else ["", ""]
+            fewer = f" (seeds: {len(policy.runs)})" if policy and len(policy.runs) < len(one.runs) else ""
+            cells += [mean(policy, "successes") + fewer, mean(policy, "violations")] if policy else ["", ""]
             cells += ["" if paper_value is None else claims.number(paper_value)]
         table.append(tuple(cells))
     return text.markdown_table(table)
@@ -73,13 +86,25 @@ def groups(results: Path, part: str) -> list[Group]:
 
 
 def missing(args: argparse.Namespace) -> str:
-    """Return a table of the runs that are stored of each part, and of all that it has."""
-    table = [("part", "runs stored", "of", "command")]
+    """Return a table of the runs that are stored of each part, of all that it has, and of what they ran on."""
+    table = [("part", "runs stored", "of", "processor", "version", "command")]
+    every: dict[str, Outcome] = {}
+    wanted: set[str] = set()
     for name in paper.PARTS:
-        part = paper.Part(name, args)
-        source = paper.Part(paper.TRAINED, args) if name == "policies" else part
-        table.append((name, str(len(part.rows())), str(len(plan(source.study()))), f"`python experiments/paper.py {name}`"))
-    return text.markdown_table(table)
+        stored = paper.Part(name, args).rows()
+        plans = plan(paper.Part(paper.TRAINED if name == "policies" else name, args).study())
+        table.append((name, *counts(stored, len(plans)), f"`python experiments/paper.py {name}`"))
+        kind = "policy " if name == "policies" else ""  # which is not the run that trained it
+        every |= {kind + key: run for key, run in stored.items()}
+        wanted |= {kind + paper.name_of(run) for run in plans}
+    return text.markdown_table([*table, ("all, each once", *counts(every, len(wanted)), "`python experiments/paper.py`")])
+
+
+def counts(stored: Mapping[str, Outcome], number: int) -> tuple[str, ...]:
+    """Return the number of stored runs, that of all, and the processors and versions of those stored."""
+    processors = sorted({run.processor for run in stored.values()})
+    versions = sorted({run.versions["fleetjax"] for run in stored.values()})
+    return str(len(stored)), str(number), ", ".join(processors), ", ".join(versions)
 
 
 def main() -> None:

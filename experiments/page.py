@@ -87,7 +87,7 @@ def groups(results: Path, part: str) -> list[Group]:
 
 def missing(args: argparse.Namespace) -> str:
     """Return a table of the runs that are stored of each part, of all that it has, and of what they ran on."""
-    table = [("part", "runs stored", "of", "processor", "version", "command")]
+    table: list[tuple[str, ...]] = [("part", "runs stored", "of", "processor", "version", "command")]
     every: dict[str, Outcome] = {}
     wanted: set[str] = set()
     for name in paper.PARTS:

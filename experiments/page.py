@@ -43,10 +43,10 @@ def readable(label: str) -> str:
     >>> readable("C.U.R., min_teleop_time 5, idle_humans_teleoperate True, tired False")
     'C.U.R., t_T = 5, idle humans teleoperate'
     """
-    label = re.sub(r", \w+ False|(?<=\w) True", "", label)
+    label = re.sub(r", \w+ False|(?<=\w) True", "", label).replace("_", " ")
     for name, short in claims.NAMES.items():
-        label = re.sub(rf"\b{name} ", f"{short} = ", label)
-    return label.replace("_", " ")
+        label = label.replace(f" {name.replace('_', ' ')} ", f" {short} = ")
+    return label
 
 
 def mean(one: Group, metric: str, *, spread: bool = False) -> str:
@@ -72,7 +72,7 @@ def achieved(found: list[Group], alone: Mapping[str, Group]) -> str:
         if alone:
             policy = alone.get(f"{place} {one.label}")
             paper_value = PUBLISHED.get(place, {}).get(algorithm)
-            fewer = f" (seeds: {len(policy.runs)})" if policy and len(policy.runs) < len(one.runs) else ""
+            fewer = f" ({len(policy.runs)} of {len(one.runs)} seeds)" if policy and len(policy.runs) < len(one.runs) else ""
             cells += [mean(policy, "successes") + fewer, mean(policy, "violations")] if policy else ["", ""]
             cells += ["" if paper_value is None else claims.number(paper_value)]
         table.append(tuple(cells))

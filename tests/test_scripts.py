@@ -75,7 +75,7 @@ def make_rows(place: Path) -> None:
 def make_page(place: Path) -> None:
     """Write the same rows, and a page with room for all tables."""
     make_rows(place)
-    names = ("main", "gradient_steps", "claims", "missing")
+    names = ("main", "gradient_steps", "ablations", "humans", "times", "equal_budget", "claims", "missing")
     (place / "page.md").write_text("".join(f"<!-- {name} -->\nold\n<!-- end -->\n" for name in names))
 
 

@@ -16,14 +16,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import paper
 
 from fleetjax import list_algorithms, make_config, statistics
-from fleetjax.config import Config, get_value
+from fleetjax.config import get_value
 from fleetjax.io import calibration, comparing, figure, files, folder, resumable, rows, scripts, text
 from fleetjax.io.outcomes import Group, Outcome, group
 from fleetjax.io.sources import collect
 
-RESULTS = Path(__file__).parent / "results"
 BUDGETS = {  # human timesteps
     "navigation": (2500, 5000, 10_000),
     "block_push": (100, 200, 300),
@@ -82,10 +82,9 @@ class Store:
         return next((place for place in self.places if place[:3] == wanted), None)
 
     def add(self, place: Place, found: list[Outcome]) -> None:
-        """Store a calibration and runs."""
+        """Store a calibration, and runs that were not stored."""
         self.places = [*(other for other in self.places if other[:3] != place[:3]), place]
-        names = {name_of(run) for run in found}
-        self.runs = [*(run for run in self.runs if name_of(run) not in names), *found]
+        self.runs += found
         files.write_json(self.table, {"calibrations": [one._asdict() for one in self.places]})
         if self.runs:
             files.write(self.rows, rows.write(self.runs))
@@ -97,19 +96,9 @@ class Store:
         return group(same)[0] if same else None
 
 
-def name_of(run: folder.Run | Outcome) -> str:
-    """Return what tells a run from others."""
-    return repr(folder.identity(run.config, run.seed))
-
-
-def settings(environment: str, algorithm: str) -> Config:
-    """Return the configuration of a rule but for its threshold: the environment's defaults, no initial period."""
-    return make_config(environment, algorithm, initial_period=0)
-
-
 def compete(store: Store, environment: str, algorithm: str, budget: int, args: argparse.Namespace) -> None:
     """Calibrate a rule and run it, as far as that is not stored."""
-    config = settings(environment, algorithm)
+    config = make_config(environment, algorithm, initial_period=0)
     place, output = store.find(environment, algorithm, budget), args.output / environment / algorithm
     if place is None:
         field = calibration.default_field(config)
@@ -118,11 +107,11 @@ def compete(store: Store, environment: str, algorithm: str, budget: int, args: a
         output.mkdir(parents=True, exist_ok=True)
         found = calibration.calibrate(request)
         place = Place(environment, algorithm, budget, field, found.value, found.human_time[0], bool(found.solved))
-    config, known = config.replace(**{place.field: place.value}), {name_of(run) for run in store.runs}
+    config, known = config.replace(**{place.field: place.value}), {paper.name_of(run) for run in store.runs}
     done = []
     for seed in range(args.seeds):
         run = folder.Run(output / f"{place.field}-{place.value:.6g}-seed{seed}", config, seed)
-        if name_of(run) not in known:
+        if paper.name_of(run) not in known:
             resumable.complete(run, checkpoint_every=0)
             done += collect(run.folder)
     store.add(place, done)
@@ -213,7 +202,7 @@ def main() -> None:
     parser.add_argument("--budgets", type=lambda numbers: [*map(int, numbers.split(","))], help="human timesteps")
     parser.add_argument("--seeds", type=int, default=5, help="number of seeds [default: 5]")
     parser.add_argument("--output", type=Path, default=Path("runs/leaderboard"), help="folder for the run folders")
-    parser.add_argument("--results", type=Path, default=RESULTS, help="folder for rows, table and figure")
+    parser.add_argument("--results", type=Path, default=paper.HERE / "results", help="folder for rows, table and figure")
     parser.add_argument("--rows-only", action="store_true", help="no runs; only table and figure")
     args = parser.parse_args()
     unknown = set(args.algorithms or ()) - set(list_algorithms())

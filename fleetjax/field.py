@@ -5,6 +5,7 @@ help of the command line is made from these tables, without loading JAX.
 """
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -48,14 +49,14 @@ def _static(default: Any, help: str, unit: str = "", *, low: float | None = None
     return dataclasses.field(default=default, metadata={"field": field})
 
 
-def _traced(default: Any, help: str, unit: str = "", *, low: float | None = 0, high: float | None = None) -> Any:
-    field = Field(help, unit, type(default), True, low, high, default)
+def _traced(
+    default: Any, help: str, unit: str = "", *, low: float | None = 0, high: float | None = None, per_human: bool = False
+) -> Any:
+    field = Field(help, unit, type(default), True, low, high, default, per_human)
     return dataclasses.field(default=default, metadata={"field": field})
 
 
-def _of_humans(default: float, help: str, unit: str = "", *, low: float = 0, high: float | None = None) -> Any:
-    field = Field(help, unit, float, True, low, high, default, per_human=True)
-    return dataclasses.field(default=default, metadata={"field": field})
+_of_humans = functools.partial(_traced, per_human=True)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,7 +131,7 @@ class Fields:
 
 FIELDS: dict[str, Field] = {f.name: f.metadata["field"] for f in dataclasses.fields(Fields)}
 
-# What only the imperfect human model has, and makes no difference at its default or alone.
+# The parameters of imperfect people, neutral by default; the shapes make no difference alone.
 OF_HUMANS = tuple(name for name, field in FIELDS.items() if field.per_human)
 SHAPES_OF_HUMANS = ("takeover_spread", "absence_time")
 OF_LINKS = ("link_failure_rate", "link_repair_rate")

@@ -212,6 +212,3 @@ def register_human_model(name: str, make: Callable[[Any, EnvSpec], HumanModel]) 
         ValueError: if the name is taken.
     """
     HUMAN_MODELS.register(name, make)
-
-
-__all__ = ["HUMAN_MODELS", "LINK_MODELS", "HumanModel", "Links", "register_human_model"]

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 import fleetjax
 from fleetjax import HumanState, Signals, priority
+from fleetjax.fleet import make_parts
 from fleetjax.learning import novelty
 from fleetjax.priority import coverage, quantiles, whittle
 
@@ -384,8 +385,6 @@ def learnt(name: str):
 
 
 def estimator_of(name: str, estimate: str):
-    from fleetjax.fleet import make_parts
-
     config, result = learnt(name)
     parts = make_parts(config, fleetjax.envs.make("navigation"))
     return parts, result.state, parts.estimators[estimate]
@@ -429,8 +428,6 @@ def test_energies_and_neighbours_tell_states_apart_that_no_human_saw():
 
 
 def test_the_radius_is_the_quantile_of_demonstrations():
-    from fleetjax.fleet import make_parts
-
     config = fleetjax.make_config("navigation", "crsail", num_robots=8, num_humans=2, num_steps=5, pretraining_steps=0)
     state = compiled(fleetjax.prepare)(config, jax.random.key(0))
     parts, seen = make_parts(config, fleetjax.envs.make("navigation")), state.estimators["novelty"]

@@ -181,7 +181,7 @@ def make_divergence(config: Config, env: Env, learner: Learner, supervisor: Supe
         return _repeat(update, config, key_train, _begin(params), policy, data)
 
     def value(state: Trained, policy: PolicyState, obs: jax.Array, robot_action: jax.Array) -> jax.Array:
-        # The same noise for all robots and timesteps: what differs is what the models say.
+        # The same noise at every timestep: what changes is what the models say.
         actions = propose(robot_action, jax.random.key(0))
         energies = jax.vmap(energy, (0, None, None))(state.params, policy.normalizer(obs), actions)
         logs = jax.nn.log_softmax(-energies, axis=-1)

@@ -26,6 +26,11 @@ def gated(signals: Signals, asking: jax.Array, keeping: jax.Array | None = None)
     return lexicographic(asking, signals.violation)
 
 
+def helped(signals: Signals) -> jax.Array:
+    """Return bool[N], the robots that had a human at the last timestep; none where it is not known."""
+    return jnp.zeros_like(signals.violation) if signals.helped is None else signals.helped
+
+
 def teleoperated(signals: Signals) -> jax.Array:
     """Return bool[N], the robots that a human teleoperated at the last timestep."""
     return signals.helped & ~signals.violation & (signals.correction > 0)

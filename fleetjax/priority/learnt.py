@@ -1,5 +1,6 @@
 """Gates by a learnt number: distance to what humans have seen, an adaptive interval, a critic of interventions, energies."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -11,6 +12,7 @@ from fleetjax.priority.base import Algorithm, PerRobot, Priority, stateless
 from fleetjax.priority.gates import gated, known, teleoperated
 from fleetjax.priority.quantiles import add, empty, on_their_own, quantile
 from fleetjax.priority.ranks import above
+from fleetjax.types import Signals
 
 MEMORY = 1000.0  # timesteps within which quantiles forget
 NARROWEST = 1e-3  # spread of an ensemble that agrees
@@ -72,15 +74,8 @@ def aim(config) -> Priority:
 
     Reference: Adaptive Intervention Mechanism (AIM), 2025; reimplemented from the text (delta = 0.05).
     """
-    rate = config.parameters["aim_rate"]
-
-    def score(signals, past, key):
-        del key
-        value = jnp.maximum(known(signals.estimates["intervention"]) + 1.0, 0.0)
-        past = add(past, value, on_their_own(signals), jnp.float32(MEMORY))
-        return gated(signals, jnp.where(value > quantile(past, 1.0 - rate), value, 0.0)), past
-
-    return Priority(empty, score)
+    shift = 1.0  # values lie about [-1, 1], and quantiles are of numbers above 0
+    return _at_a_rate(lambda signals: jnp.maximum(known(signals.estimates["intervention"]) + shift, 0.0), config, "aim_rate")
 
 
 def iifl(config) -> Priority:
@@ -91,13 +86,17 @@ def iifl(config) -> Priority:
 
     Reference: Datta et al., IIFL, 2023 (Section 4, and the published code: the 99.9th percentile of the last 1 000 steps).
     """
-    rate = config.parameters["iifl_rate"]
+    return _at_a_rate(lambda signals: known(signals.estimates["divergence"]), config, "iifl_rate")
+
+
+def _at_a_rate(value_of: Callable[[Signals], jax.Array], config, rate: str) -> Priority:
+    """Return the gate that asks where a value f32[N] is above its running quantile at level 1 - the parameter `rate`."""
 
     def score(signals, past, key):
         del key
-        value = known(signals.estimates["divergence"])
+        value = value_of(signals)
         past = add(past, value, on_their_own(signals), jnp.float32(MEMORY))
-        return gated(signals, jnp.where(value > quantile(past, 1.0 - rate), value, 0.0)), past
+        return gated(signals, jnp.where(value > quantile(past, 1.0 - config.parameters[rate]), value, 0.0)), past
 
     return Priority(empty, score)
 

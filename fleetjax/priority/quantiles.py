@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from fleetjax.priority.gates import helped
 from fleetjax.types import Signals
 
 LOWEST, HIGHEST = 1e-6, 1e3  # values beyond count as these
@@ -60,4 +61,4 @@ def quantile(histogram: Histogram, level: jax.Array | float) -> jax.Array:
 
 def on_their_own(signals: Signals) -> jax.Array:
     """Return bool[N], the robots that moved without help at the last timestep and are not in violation."""
-    return ~signals.violation if signals.helped is None else ~(signals.violation | signals.helped)
+    return ~(signals.violation | helped(signals))

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 
 from fleetjax.field import PARAMETERS
 from fleetjax.priority.base import Algorithm, PerRobot, Priority
+from fleetjax.priority.gates import helped
 
 
 def round_robin(config) -> Priority:
@@ -18,8 +19,7 @@ def round_robin(config) -> Priority:
 
     def score(signals, without, key):
         del key
-        helped = jnp.zeros_like(signals.violation) if signals.helped is None else signals.helped
-        without = jnp.where(helped, 0.0, without.values + 1.0)
+        without = jnp.where(helped(signals), 0.0, without.values + 1.0)
         return jnp.where(without > threshold, without, 0.0), PerRobot(without)
 
     return Priority(init, score)

@@ -10,6 +10,7 @@ import numpy as np
 from fleetjax import sharding
 from fleetjax.field import PARAMETERS
 from fleetjax.priority.base import Algorithm, PerRobot, Priority
+from fleetjax.priority.gates import helped
 
 OK, RISKY, VIOLATED = range(3)
 WORTH = (1.0, 1.0, 0.0)  # of a timestep in each state: the robot moves, or lies
@@ -75,8 +76,8 @@ def whittle(config) -> Priority:
         del key
         in_danger = (signals.uncertainty > config.uncertainty_threshold) | (signals.risk > config.risk_threshold)
         state = jnp.where(signals.violation, VIOLATED, jnp.where(in_danger, RISKY, OK)).astype(jnp.int32)
-        before, helped = past.states.values, jnp.zeros_like(signals.violation) if signals.helped is None else signals.helped
-        cell = jnp.where(before < 0, -1, 9 * helped.astype(jnp.int32) + 3 * before + state)
+        before = past.states.values
+        cell = jnp.where(before < 0, -1, 9 * helped(signals).astype(jnp.int32) + 3 * before + state)
         seen = sharding.total((cell[:, None] == jnp.arange(18)).astype(jnp.float32)).reshape(2, 3, 3)
         counts = past.transitions + seen
         passive, active = counts / jnp.sum(counts, axis=2, keepdims=True)

@@ -208,6 +208,7 @@ def main() -> None:
     unknown = set(args.algorithms or ()) - set(list_algorithms())
     if unknown:
         parser.error(f"unknown algorithms: {', '.join(sorted(unknown))}; choose from {', '.join(list_algorithms())}")
+    args.results.mkdir(parents=True, exist_ok=True)
     store = Store(args.results)
     for environment in [] if args.rows_only else args.environments:
         for algorithm in args.algorithms or ORDER:

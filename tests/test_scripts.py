@@ -158,6 +158,15 @@ CASES = {
         prepare=make_runs,
         quick=True,
     ),
+    "experiments/leaderboard.py": Case(
+        (
+            "navigation --algorithms random --budgets 2500 --seeds 2 --output runs --results rows",
+            "navigation --algorithms random --budgets 2500 --seeds 3 --output runs --results rows",
+            "--rows-only --results rows",
+        ),
+        (r"^rows/leaderboard\.md$",),
+        ("rows/leaderboard.csv", "rows/leaderboard.json", "rows/leaderboard.md", "rows/leaderboard.png"),
+    ),
     "experiments/page.py": Case(
         ("--results rows --page page.md",),
         (r"^page\.md$",),

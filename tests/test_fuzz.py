@@ -20,8 +20,10 @@ from hypothesis import strategies as st
 
 import fleetjax
 from fleetjax import cli
-from fleetjax.config import FIELDS, Config, all_fields, needed_human_capacity
+from fleetjax.config import ALLOCATIONS, FIELDS, Config, all_fields, needed_human_capacity
+from fleetjax.humans import HUMAN_MODELS, LINK_MODELS
 from fleetjax.io import checkpoint, files, folder, interventions, plain
+from fleetjax.physics.base import BACKENDS
 
 OF_A_RUN = [name for name in folder.DATA if name != folder.RECORD]  # which consoles alone have
 FEW = hypothesis.settings(max_examples=200, deadline=None, suppress_health_check=list(hypothesis.HealthCheck))
@@ -51,20 +53,22 @@ def values(name: str) -> st.SearchStrategy[Any]:
     """Return values of a field, most of them good."""
     field = FIELDS[name]
     low, high = field.low if field.low is not None else -2, field.high
+    names = {
+        "algorithm": fleetjax.list_algorithms(),
+        "supervisor": ("", *fleetjax.list_supervisors()),
+        "backend": BACKENDS,
+        "allocation": ALLOCATIONS,
+        "human_model": HUMAN_MODELS.names(),
+        "link_model": LINK_MODELS.names(),
+    }
     good = {
-        str: st.sampled_from(
-            {
-                "algorithm": fleetjax.list_algorithms(),
-                "supervisor": ("", *fleetjax.list_supervisors()),
-                "backend": ("auto", "native", "mjx"),
-            }.get(name, ("navigation",))
-        ),
+        str: st.sampled_from(names.get(name, ("navigation",))),
         bool: st.booleans(),
         tuple: st.lists(st.integers(1, 300), min_size=1, max_size=3).map(tuple),
         int: st.integers(int(low), 2_000),
-        float: st.floats(float(low), high if high is not None else 1e3, width=32),
+        float: st.floats(float(np.float32(low)), float(np.float32(1e3 if high is None else high)), width=32),
     }[field.kind]
-    return st.one_of(*[good] * 12, odd)
+    return st.integers(0, 12).flatmap(lambda number: good if number else odd)
 
 
 CONFIGS = st.fixed_dictionaries({}, optional={name: values(name) for name in FIELDS if name != "environment"})

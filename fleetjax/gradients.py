@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
+from jax.interpreters import partial_eval
 
 from fleetjax import checks
 from fleetjax.config import Config, all_fields, get_value
@@ -92,9 +93,9 @@ def sensitivity(
             work with this configuration, or the run does not fit the memory; the message says what would work.
 
     Warns:
-        UserWarning: if the objective did not depend on a field.
+        UserWarning: if the objective does not depend on a field, or its derivative by it is exactly 0.
     """
-    request = check_request(config, keys, fields, method, width, num_samples, env)
+    request = check_request(config, keys, fields, objective or final_return, method, width, num_samples, env)
     config, env, names = request.config, request.env, request.names
     derive = make_gradient(config, env, objective or final_return, names, method, request.widths, num_samples)
 
@@ -107,7 +108,7 @@ def sensitivity(
         {name: jnp.mean(gradients[name]) for name in names},
         {name: _standard_error(gradients[name], variances[name]) for name in names},
     )
-    _warn_of_zeros(found, hard=method == "forward" and config.allocation == "hard")
+    _warn_of_zeros(found, request.unused, hard=method == "forward" and config.allocation == "hard")
     return found
 
 
@@ -120,6 +121,7 @@ class Request(NamedTuple):
         names: of the fields.
         widths: of the noise on each; empty without noise.
         env: environment.
+        unused: fields on which the objective does not depend.
     """
 
     config: Config
@@ -127,12 +129,14 @@ class Request(NamedTuple):
     names: tuple[str, ...]
     widths: Values
     env: Env
+    unused: list[str]
 
 
 def check_request(
     config: Config,
     keys: jax.Array,
     fields: str | Sequence[str],
+    objective: Objective,
     method: str,
     width: float | Mapping[str, float] | None,
     num_samples: int,
@@ -142,6 +146,9 @@ def check_request(
 
     Raises:
         ValueError: as `sensitivity`.
+
+    Warns:
+        UserWarning: of fields on which the objective does not depend.
     """
     names = (fields,) if isinstance(fields, str) else tuple(fields)
     keys = _as_keys(keys)
@@ -155,13 +162,15 @@ def check_request(
     env = checks.check_run(config, env)
     if method != "smoothed":
         _check_derivatives(config, env, method)
-    return Request(config, keys, names, _widths(config, names, width) if method == "smoothed" else {}, env)
+    widths = _widths(config, names, width) if method == "smoothed" else {}
+    without_effect = unused(config, env, objective, names)
+    for name in without_effect:
+        warnings.warn(f"the objective does not depend on {name}, its derivative is 0: omit it from fields", stacklevel=4)
+    return Request(config, keys, names, widths, env, without_effect)
 
 
-def make_gradient(
-    config: Config, env: Env, worth: Objective, names: Sequence[str], method: str, widths: Values, num_samples: int
-) -> Callable[[Values, jax.Array, FleetState], tuple[jax.Array, Values, Values]]:
-    """Return `(values by field, key, state) -> (objective, gradient, variance of the gradient)` of runs from a state."""
+def make_objective(config: Config, env: Env, worth: Objective) -> Callable[[Values, jax.Array, FleetState], jax.Array]:
+    """Return `(values by field, key, state) -> f32[]`, what a run from a state is worth with other values."""
 
     def objective(values: Values, key: jax.Array, state: FleetState) -> jax.Array:
         changed = config.replace(**values)
@@ -169,6 +178,23 @@ def make_gradient(
         if value.ndim:
             raise ValueError(f"objective returned an array of shape {value.shape}; it must return one number")
         return value.astype(jnp.float32)
+
+    return objective
+
+
+def unused(config: Config, env: Env, worth: Objective, names: Sequence[str]) -> list[str]:
+    """Return the fields that have no effect on the objective, as its program tells without being run."""
+    values = {name: jax.typeof(get_value(config, name)) for name in names}
+    program = jax.make_jaxpr(make_objective(config, env, worth))(values, jax.random.key(0), checks.state_shapes(config, env))
+    _, is_used = partial_eval.dce_jaxpr(program.jaxpr, [True])
+    return [name for name, used in zip(sorted(names), is_used, strict=False) if not used]  # dicts are flattened in order
+
+
+def make_gradient(
+    config: Config, env: Env, worth: Objective, names: Sequence[str], method: str, widths: Values, num_samples: int
+) -> Callable[[Values, jax.Array, FleetState], tuple[jax.Array, Values, Values]]:
+    """Return `(values by field, key, state) -> (objective, gradient, variance of the gradient)` of runs from a state."""
+    objective = make_objective(config, env, worth)
 
     def smoothed(values: Values, key: jax.Array, state: FleetState) -> tuple[jax.Array, Values, Values]:
         known = all_fields(config.algorithm)
@@ -315,9 +341,9 @@ def reverse_bytes(config: Config, env: Env) -> int:
     return checks.count_bytes(state) * (config.num_steps // size + 2) + checks.count_bytes(kept) * size
 
 
-def _warn_of_zeros(found: Sensitivity, *, hard: bool) -> None:
-    """Warn of fields on which the objective did not depend, where numbers are known."""
+def _warn_of_zeros(found: Sensitivity, known: Sequence[str], *, hard: bool) -> None:
+    """Warn of fields whose derivative is exactly 0, where numbers are known, but for the `known` ones."""
+    why = ": in a hard fleet, thresholds, ranks and counts have none; try method = 'smoothed'" if hard else ""
     for name, slope in found.gradient.items():
-        if not isinstance(slope, Tracer) and slope == 0:
-            other = "; in a hard fleet, thresholds and ranks have no derivative: try method = 'smoothed'" if hard else ""
-            warnings.warn(f"the objective did not depend on {name}: its derivative is exactly 0{other}", stacklevel=4)
+        if name not in known and not isinstance(slope, Tracer) and slope == 0:
+            warnings.warn(f"the derivative by {name} is exactly 0{why}", stacklevel=4)

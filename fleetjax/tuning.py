@@ -68,7 +68,7 @@ def tune(
     """
     if steps < 1:
         raise ValueError(f"steps = {steps} must be at least 1")
-    request, hard = check_request(config, keys, fields, method, width, num_samples, env), config
+    request, hard = check_request(config, keys, fields, objective or final_return, method, width, num_samples, env), config
     config, env, names = request.config, request.env, request.names
     known = all_fields(config.algorithm)
     for name in names:

@@ -1,6 +1,7 @@
 """Gradients of a fleet's worth: the soft allocation and its limit, three ways to a gradient, and tuning along it."""
 
 import math
+import warnings
 from functools import partial
 from typing import Any
 
@@ -275,8 +276,27 @@ def test_relaxed_and_forward_gradients_agree(config):
 
 
 def test_a_field_that_does_not_matter_is_told(config):
-    with pytest.warns(UserWarning, match="did not depend on learning_rate"):
-        fleetjax.sensitivity(config, KEYS[0], "learning_rate", objective=lambda m, c: jnp.float32(1), num_samples=2)
+    fields = ("risk_threshold", "takeover_time", "learning_rate")  # perfect humans take over at once
+    cases: list[tuple[Any, set[str]]] = [
+        (human_time, {"takeover_time"}),
+        (lambda metrics, config: config.risk_threshold, {"takeover_time", "learning_rate"}),
+    ]
+    for objective, unused in cases:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            derive = jax.jit(
+                lambda keys, worth=objective: fleetjax.sensitivity(
+                    config, keys, fields, objective=worth, width={"takeover_time": 1.0}, num_samples=2
+                )
+            )
+            derive.lower(KEYS)
+        told = {name for name in fields for one in caught if f"does not depend on {name}," in str(one.message)}
+        assert told == unused
+
+
+def test_a_derivative_that_is_zero_is_told(config):
+    with pytest.warns(UserWarning, match="derivative by uncertainty_threshold is exactly 0.*try method = 'smoothed'"):
+        fleetjax.sensitivity(config, KEYS[0], "uncertainty_threshold", method="forward")
 
 
 @pytest.mark.slow

@@ -7,7 +7,8 @@ A part is a file of `experiments/studies/`, and `policies`: the trained policies
 timesteps as they were trained, without teleoperation.
 
 Runs go to a folder each below --output, their rows to `experiments/results/PART.csv`, and tables and a figure beside them.
-Repeat the command to resume: runs that have a row in one of these files, and finished runs, are not run again.
+Repeat the command to resume: runs that have a row in one of these files, and finished runs, are not run again. Only a policy
+that is not evaluated yet, and whose run folder is not below --output, is trained again.
 """
 
 import argparse
@@ -69,35 +70,50 @@ class Part:
 
     def run(self) -> None:
         """Complete the runs, and store the rows of those that finished, even if others fail or it is interrupted."""
-        study, own = self.study(), self.rows()
-        runs = plan(study)
+        runs, own = plan(self.study()), self.rows()
         known = own | {
             name: run for other in PARTS if other != "policies" for name, run in Part(other, self.args).rows().items()
         }
         missing = [run for run in runs if name_of(run) not in known]
-        sweep.check_folder(study, runs)
         try:
-            if missing:
-                sweep.run_all(study, missing)
+            self.complete(missing)
         finally:
             known |= {name_of(run): collect(run.folder)[0] for run in missing if is_finished(run)}
             wanted = dict.fromkeys([*map(name_of, runs), *own])
             self.store(known[name] for name in wanted if name in known)
 
+    def complete(self, runs: list[folder.Run]) -> None:
+        """Complete runs of this part in their folders."""
+        study = self.study()
+        sweep.check_folder(study, plan(study))
+        if runs:
+            sweep.run_all(study, runs)
+
     def evaluate(self, trained: "Part") -> None:
         """Run the trained policies of another part, each with the seed after its own. Expert's run stands for itself."""
         known = self.rows()
         missing = [run for run in plan(trained.study()) if name_of(run) not in known]
-        here = [run for run in missing if is_finished(run)]
-        print(f"{len(here)} policies to evaluate; {len(missing) - len(here)} have no finished run folder here")
-        for run in here:
-            found = collect(run.folder)[0]
-            if get_algorithm(run.config.algorithm).pretrains:
-                policy, key = folder.read_policy(folder.read_run(run.folder)), jax.random.key(run.seed + 1)
-                found = found._replace(metrics=jax.device_get(jax.jit(evaluate)(run.config, key, policy).metrics))
-            known[name_of(run)] = found
-            self.store(known.values())
-            print(f"{run.folder.name}: {found.metrics.successes.sum():,} successes", flush=True)
+        elsewhere = [run for run in missing if not is_finished(run)]
+        for run in missing:
+            if run not in elsewhere:
+                self.evaluate_one(run, known)
+        if elsewhere:
+            print(
+                f"{len(elsewhere)} policies have no run folder in {trained.args.output / trained.name}: they are trained again"
+            )
+        trained.complete(elsewhere)
+        for run in elsewhere:
+            self.evaluate_one(run, known)
+
+    def evaluate_one(self, run: folder.Run, known: dict[str, Outcome]) -> None:
+        """Run the policy of a finished run on its own, and store it among the `known` ones."""
+        found = collect(run.folder)[0]
+        if get_algorithm(run.config.algorithm).pretrains:
+            policy, key = folder.read_policy(folder.read_run(run.folder)), jax.random.key(run.seed + 1)
+            found = found._replace(metrics=jax.device_get(jax.jit(evaluate)(run.config, key, policy).metrics))
+        known[name_of(run)] = found
+        self.store(known.values())
+        print(f"{run.folder.name}: {found.metrics.successes.sum():,} successes", flush=True)
 
     def show(self) -> None:
         """Write tables and a figure of the stored rows."""

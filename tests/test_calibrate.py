@@ -50,6 +50,7 @@ def test_the_same_command_answers_from_what_it_ran(solved, capsys):
 def test_the_nearest_is_told_where_nothing_spends_so_much(tmp_path, capsys):
     assert calibrate(tmp_path, "--human-time", 239, "--seeds", 1, "--most", 2, "--tolerance", 0.001) == 0
     assert "No value that was tried spends 239; this one is the nearest." in capsys.readouterr().out
+    assert json.loads((tmp_path / "calibration.json").read_text(), parse_constant=pytest.fail)["error"] is None
 
 
 @pytest.mark.parametrize(

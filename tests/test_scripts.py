@@ -177,16 +177,16 @@ CASES = {
         (
             "main policies --studies . --workers 1 --output runs --results rows",
             "main policies --studies . --output elsewhere --results rows",
+            "policies --studies . --workers 1 --output elsewhere --results again",
             "main policies --studies . --results rows --rows-only",
         ),
         (
             r"^2 runs finished",
-            r"^2 policies to evaluate; 0 have no finished run folder here$",
             r"^navigation-constraint-seed0: \d+ successes$",
-            r"^0 policies to evaluate; 0 have",
+            r"^2 policies have no run folder in elsewhere/main: they are trained again$",
             r"^rows/policies\.md$",
         ),
-        ("rows/main.csv", "rows/main.md", "rows/main.png", "rows/policies.csv", "runs/main/sweep.json"),
+        ("rows/main.csv", "rows/main.md", "rows/main.png", "rows/policies.csv", "again/policies.csv", "runs/main/sweep.json"),
         lambda place: (place / "main.toml").write_text(TINY_STUDY) and None,
     ),
     "experiments/settle_cubes.py": Case(

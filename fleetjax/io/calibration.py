@@ -110,6 +110,8 @@ def calibrate(request: Request) -> Calibration:
             value, spent = moved, again
     found = Calibration(value, spent, _error(value, spent, tried, scale), _is_near(request, spent), tried)
     content = found._asdict() | {"field": request.field, "wanted": request.human_time, "seeds": request.seeds}
+    if math.isnan(found.error):
+        content["error"] = None  # JSON has no NaN
     files.write_json(request.output / FILE, content | {"versions": folder.versions()})
     return found
 

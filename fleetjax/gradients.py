@@ -206,7 +206,8 @@ def make_gradient(
             }
             return objective(moved, key, state)
 
-        rises = jax.lax.map(lambda z: (shifted(z, 1) - shifted(z, -1)) / 2, noise)
+        chunk = chunk_size(config, env)
+        rises = jax.lax.map(lambda z: (shifted(z, 1) - shifted(z, -1)) / 2, noise, batch_size=chunk if chunk > 1 else None)
         slopes = {name: rises * noise[:, i] / widths[name] for i, name in enumerate(names)}
         gradient = {name: jnp.mean(slope) for name, slope in slopes.items()}
         ddof = min(1, num_samples // 2 - 1)
@@ -226,6 +227,17 @@ def make_gradient(
         return value[0], {name: slopes[i] for i, name in enumerate(names)}, jax.tree.map(jnp.zeros_like, values)
 
     return {"smoothed": smoothed, "relaxed": relaxed, "forward": forward}[method]
+
+
+def chunk_size(config: Config, env: Env) -> int:
+    """Return how many pairs of shifted runs are computed side by side: as many as fit half of the memory.
+
+    On a CPU it is one, since runs one after the other are faster there.
+    """
+    if jax.default_backend() == "cpu":
+        return 1
+    of_pair = 2 * 3 * checks.count_bytes(checks.state_shapes(config, env))  # at the start, at the end and in between
+    return max(checks.memory() // 2 // of_pair, 1)
 
 
 def within_range(field: Field, value: jax.Array) -> jax.Array:

@@ -273,6 +273,33 @@ def test_a_width_may_be_traced(config):
 
 
 @pytest.mark.slow
+def test_samples_side_by_side_are_those_one_after_the_other(config, monkeypatch):
+    loss = lambda metrics, config: jnp.sum(metrics.policy_loss)  # noqa: E731
+    derive = partial(fleetjax.sensitivity, config, KEYS[0], "learning_rate", objective=loss, num_samples=6)
+    alone = derive()
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    pair = 6 * checks.count_bytes(checks.state_shapes(config, fleetjax.envs.make("navigation")))
+    monkeypatch.setattr(checks, "memory", lambda: 2 * 2 * pair)
+    monkeypatch.setattr(checks, "check_memory", lambda *_: None)
+    assert gradients.chunk_size(config, fleetjax.envs.make("navigation")) == 2
+    together = derive()
+    np.testing.assert_allclose(together.gradient["learning_rate"], alone.gradient["learning_rate"], rtol=0.05)
+    monkeypatch.setattr(checks, "memory", lambda: 0)
+    assert gradients.chunk_size(config, fleetjax.envs.make("navigation")) == 1
+
+
+@pytest.mark.slow
+def test_the_estimate_of_memory_is_what_the_program_takes(config):
+    for length in (36, 100):
+        soft = config.replace(allocation="soft", num_steps=length, human_capacity=300)
+        env = fleetjax.envs.make("navigation")
+        derive = gradients.make_gradient(soft, env, human_time, ("risk_threshold",), "relaxed", {}, 2)
+        values, state = {"risk_threshold": jax.typeof(soft.risk_threshold)}, checks.state_shapes(soft, env)
+        program = jax.jit(derive).lower(values, KEYS[0], state).compile()
+        assert 0.5 < gradients.reverse_bytes(soft, env) / program.memory_analysis().temp_size_in_bytes < 2
+
+
+@pytest.mark.slow
 def test_whole_numbers_can_be_smoothed(config):
     worth = lambda metrics, config: config.min_teleop_time.astype(jnp.float32) ** 2  # noqa: E731
     found = fleetjax.sensitivity(

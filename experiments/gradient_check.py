@@ -5,7 +5,8 @@
 The checks, each a table:
 
 - `differences`: the relaxed gradient against finite differences of the same objective, one field and seed at a time, where
-  no hard event (a violation, a reset, a change of who helps whom) lies between the two runs, and where one does.
+  no hard event (a violation, a reset, a change of who helps whom) lies between the two runs, and where one does. A
+  difference is settled if half its width changes it by less than 1 %: only then can it tell what the derivative is.
 - `temperature`: relaxed gradients, as the temperature falls, against the smoothed gradient of the hard objective.
 - `steps`: how much a step along each gradient raises the return of the hard fleet on fresh seeds.
 - `length`: how large the relaxed gradient grows with the length of the run.
@@ -39,6 +40,7 @@ SHORT = (3, 10, 30, 100)  # of finite differences
 WIDTH = 0.5  # of the noise in smoothed gradients, in units of each field; less leaves more noise than slope
 STEP = 0.3  # by which a step changes the logarithms of all fields, as a vector
 DIFFERENCE = 2e-3  # half the relative distance of the two runs of a finite difference
+SETTLED = 0.01  # by which a finite difference of half the width may differ
 EVENTS = ("violations", "hard_resets", "idle", "switches", "choices")  # counts that differ if a hard event does
 CHECKS = ("differences", "temperature", "steps", "length")
 
@@ -90,27 +92,39 @@ def check_differences(config: Config, keys: jax.Array, lengths: Sequence[int]) -
         counts = [getattr(metrics, name) for name in EVENTS]
         return final_return(metrics, config), [*counts, last.env.episode_step, last.humans.robot]
 
-    def compare(config: Config, name: str, slope: float, key: jax.Array, state: fleetjax.FleetState) -> tuple[bool, float]:
-        """Return whether a hard event lies between the two runs of a difference, and how far it is from the slope."""
+    def differ(config: Config, name: str, width: float, key: jax.Array, state: fleetjax.FleetState) -> tuple[bool, float]:
+        """Return whether a hard event lies between the two runs of a difference, and the difference by the field."""
         value = get_value(config, name)
-        ends = [run(config.replace(**{name: value * (1 + sign * DIFFERENCE)}), key, state) for sign in (1, -1)]
+        ends = [run(config.replace(**{name: value * (1 + sign * width)}), key, state) for sign in (1, -1)]
         (high, above), (low, below) = ends
-        difference = float((high - low) / (2 * DIFFERENCE * value))
         switched = any(np.any(x != y) for x, y in zip(above, below, strict=True))
-        return switched, abs(slope - difference) / max(abs(slope), abs(difference), 1e-12)
+        return switched, float((high - low) / (2 * width * value))
+
+    def compare(config: Config, name: str, slope: float, key: jax.Array, state: fleetjax.FleetState) -> tuple[str, float]:
+        """Return what kind of difference there is for a field, and how far the slope is from it."""
+        switched, wide = differ(config, name, DIFFERENCE, key, state)
+        _, narrow = differ(config, name, DIFFERENCE / 2, key, state)
+        kind = "some" if switched else "none" if apart(wide, narrow) < SETTLED else "none, not settled"
+        return kind, apart(slope, wide)
 
     rows: Table = [("timesteps", "hard events between the runs", "pairs", "median error", "90th percentile")]
     for length in lengths:
-        shorter, errors = soft.replace(num_steps=length), {False: [], True: []}
+        shorter = soft.replace(num_steps=length)
+        errors: dict[str, list[float]] = {"none": [], "none, not settled": [], "some": []}
         for key in keys:
             state, slopes = prepare(shorter, key), relaxed(shorter, key[None]).gradient
             for name in FIELDS:
-                switched, error = compare(shorter, name, float(slopes[name]), key, state)
-                errors[switched].append(error)
-        for switched, found in errors.items():
+                kind, error = compare(shorter, name, float(slopes[name]), key, state)
+                errors[kind].append(error)
+        for kind, found in errors.items():
             shown = [f"{100 * np.quantile(found, q):.2g} %" for q in (0.5, 0.9)] if found else ["-", "-"]
-            rows.append((str(length), "some" if switched else "none", str(len(found)), *shown))
+            rows.append((str(length), kind, str(len(found)), *shown))
     return rows
+
+
+def apart(a: float, b: float) -> float:
+    """Return how far two numbers are from each other, relative to the larger."""
+    return abs(a - b) / max(abs(a), abs(b), 1e-12)
 
 
 def by_temperature(slopes: dict[float, np.ndarray], reference: np.ndarray) -> tuple[Table, list[tuple[float, float]]]:

@@ -5,6 +5,7 @@ import importlib.util
 import json
 import logging
 import os
+import re
 import signal
 import socket
 import threading
@@ -24,6 +25,7 @@ from fleetjax import cli, envs
 from fleetjax.console import controls, engine, guard, messages, pages, record, seats
 from fleetjax.console.engine import EMPTY, PERSON, SIMULATED, Engine, Inputs, View
 from fleetjax.io import files, folder, metrics_csv
+from fleetjax.io import flags as command_line
 
 NOBODY = np.zeros(2, bool)
 STILL = np.zeros((2, 2), np.float32)
@@ -522,6 +524,12 @@ def test_a_session_replays_to_the_bit_and_damage_is_refused(tmp_path, port_of, c
 
     assert cli.main(["replay", str(path)]) == 0
     assert "60 timesteps replayed; metrics.csv and policy.msgpack agree to the bit" in capsys.readouterr().out
+    assert cli.main(["humans", "fit", str(path)]) == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"^seat 1 +\d+ +", printed, re.MULTILINE)
+    command = printed.splitlines()[-1]
+    assert command.startswith("fleetjax run navigation --takeover-time ")
+    assert 0 <= command_line.parse(command.split()[1:]).takeover_time < 60
     assert cli.main(["plot", str(path), "--output", str(tmp_path / "all.png")]) == 0
     capsys.readouterr()
     assert "supervised by people" in refused(capsys, "run", "--resume", path)

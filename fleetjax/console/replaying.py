@@ -27,7 +27,7 @@ def read_record(run: folder.Run) -> np.ndarray:
     """
     path = run.folder / folder.RECORD
     if not path.exists():
-        raise ValueError(f"{run.folder} has no {folder.RECORD}; only runs of `fleetjax console` can be replayed")
+        raise ValueError(f"{run.folder} has no {folder.RECORD}; only runs of `fleetjax console` have one")
     data = path.read_bytes()
     if folder.RECORD not in run.digests:
         raise ValueError(f"{path} cannot be used: the session was killed before its digests were stored")

@@ -374,6 +374,19 @@ def replay(arguments: argparse.Namespace) -> None:
     print(f"{run.folder}: {text.plural(len(metrics.successes), 'timestep')} replayed; {compared} agree to the bit")
 
 
+def fit_humans(arguments: argparse.Namespace) -> None:
+    """Fit the model of imperfect humans to the people of a console's session."""
+    from fleetjax.console import fitting, replaying
+
+    with _refusing():
+        run = folder.read_run(arguments.run)
+        rows, usual = replaying.read_record(run), FIELDS["absence_time"].default
+        found = fitting.fit(rows, fitting.people(rows), absence_time=usual)
+    print(text.table(fitting.report(rows, absence_time=usual), right=range(1, 7)))
+    given = (f"--{name.replace('_', '-')} {value:.3g}" for name, value in found._asdict().items())
+    print(f"\nTimes are in timesteps. Humans like these:\nfleetjax run {run.config.environment} {' '.join(given)}")
+
+
 COMMANDS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "run": run_fleet,
     "sweep": run_sweep,
@@ -386,4 +399,5 @@ COMMANDS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "render": render_robots,
     "console": supervise,
     "replay": replay,
+    "humans": fit_humans,
 }

@@ -87,6 +87,9 @@ _RENDER_ABOUT = """Draw robots as an animation, a grid of tiles. Teleoperated ro
 
 expert: the supervisor acts on every robot. robot: the trained policy of a run acts, and nobody teleoperates. mixed: the
 pre-trained fleet runs, and its humans help."""
+_HUMANS_ABOUT = """Print how long people took to act on robots in a console session, how much longer if they came from another
+robot, and how often they were away: as a table by seat, and as flags of `fleetjax run` for simulated humans like them. Noise,
+mistakes and delays are not fitted."""
 _EVALUATE_ABOUT = """Run the trained policy of a run without teleoperation: humans only reset robots in violation, and nothing
 is learnt. Prints a table and writes RUN/evaluation.json."""
 _CONSOLE_ABOUT = """Run a fleet one timestep at a time, with people as supervisors: each opens a page, gets a seat, and helps
@@ -162,7 +165,15 @@ def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser
     _add_console(commands, environment)
     replay = commands.add_parser("replay", help="repeat a console session from its record, and compare every bit")
     replay.add_argument("run", metavar="RUN", type=Path, help="run folder of a console session")
+    _add_humans(commands)
     return parser, list(commands.choices)
+
+
+def _add_humans(commands: Any) -> None:
+    about = "models of imperfect humans from what people did in a console session"
+    humans = commands.add_parser("humans", help=about, usage="fleetjax humans fit RUN", description=_HUMANS_ABOUT)
+    humans.add_argument("action", choices=("fit",), metavar="fit", help="fit a model")
+    humans.add_argument("run", metavar="RUN", type=Path, help="run folder of a console session")
 
 
 def _add_compare(commands: Any) -> None:

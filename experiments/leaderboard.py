@@ -4,7 +4,8 @@
     python experiments/leaderboard.py --rows-only          # table and figure from the stored rows; no simulation
 
 For each environment, algorithm and budget, the algorithm's threshold is calibrated on seed 100, so that a run spends the
-budget. Then it runs with seeds 0, 1, ... Rows go to `experiments/results/leaderboard.csv`, what was calibrated to
+budget. Then it runs with seeds 0, 1, ... An algorithm without a threshold spends what it spends. No algorithm has an initial
+period, and extra demonstrations count as human time. Rows go to `experiments/results/leaderboard.csv`, what was calibrated to
 `leaderboard.json`, and the table and the figure beside them.
 
 Repeat the command to resume: runs that are stored, or finished below --output, are not run again.
@@ -36,6 +37,7 @@ ORDER = (  # in which they are run
     *("thrifty_quantile", "conformal", "safe_dagger", "crsail", "aim", "dropout_dagger", "asa", "weighted", "whittle", "iifl"),
     *("constraint", "constraint_trained", "longest_waiting", "thrifty_dagger"),
 )
+FIXED = ("constraint", "constraint_trained", "longest_waiting")  # whose human time no threshold changes
 CALIBRATED_ON = 100  # seed
 MOST = 8  # runs of a search
 TOLERANCE = 0.05
@@ -48,7 +50,7 @@ class Place(NamedTuple):
         environment: its name.
         algorithm: its name.
         budget: human timesteps that were wanted.
-        field: the parameter that was searched.
+        field: the parameter that was searched; "" = the algorithm has none.
         value: the nearest that was found.
         spent: human timesteps with it on the calibration's seed.
         solved: whether these are within 5 % of the budget.
@@ -92,7 +94,9 @@ class Store:
     def group_of(self, place: Place) -> Group | None:
         """Return the runs at a calibrated value, as one group."""
         here = [run for run in self.runs if (run.config.environment, run.config.algorithm) == place[:2]]
-        same = [run for run in here if np.float32(get_value(run.config, place.field)) == np.float32(place.value)]
+        same = [
+            run for run in here if not place.field or np.float32(get_value(run.config, place.field)) == np.float32(place.value)
+        ]
         return group(same)[0] if same else None
 
 
@@ -100,17 +104,21 @@ def compete(store: Store, environment: str, algorithm: str, budget: int, args: a
     """Calibrate a rule and run it, as far as that is not stored."""
     config = make_config(environment, algorithm, initial_period=0)
     place, output = store.find(environment, algorithm, budget), args.output / environment / algorithm
-    if place is None:
+    if algorithm in FIXED:
+        place = Place(environment, algorithm, budget, "", 0.0, 0.0, solved=False)
+    elif place is None:
         field = calibration.default_field(config)
         request = calibration.Request(config, field, budget, (CALIBRATED_ON,), TOLERANCE, MOST, output)
         calibration.check(request)
         output.mkdir(parents=True, exist_ok=True)
         found = calibration.calibrate(request)
         place = Place(environment, algorithm, budget, field, found.value, found.human_time[0], bool(found.solved))
-    config, known = config.replace(**{place.field: place.value}), {paper.name_of(run) for run in store.runs}
+    known, name = {paper.name_of(run) for run in store.runs}, "as-it-is"
+    if place.field:
+        config, name = config.replace(**{place.field: place.value}), f"{place.field}-{place.value:.6g}"
     done = []
     for seed in range(args.seeds):
-        run = folder.Run(output / f"{place.field}-{place.value:.6g}-seed{seed}", config, seed)
+        run = folder.Run(output / f"{name}-seed{seed}", config, seed)
         if paper.name_of(run) not in known:
             resumable.complete(run, checkpoint_every=0)
             done += collect(run.folder)
@@ -135,8 +143,8 @@ def _part(store: Store, places: list[Place]) -> str:
     for place, one in found:
         successes = _values(one, "successes")
         cells = [f"{text.label(place.algorithm)}{'' if place.solved else ' *'}", str(len(successes)), _interval(successes)]
-        cells += [text.count(float(np.mean(_values(one, metric)))) for metric in ("human_steps", "violations")]
-        cells += [f"{np.mean(_values(one, 'rohe')):.3g}", _difference(one, reference)]
+        cells += [text.count(_human_time(one)), text.count(float(np.mean(_values(one, "violations"))))]
+        cells += [f"{np.mean(_values(one, 'rohe_with_demonstrations')):.3g}", _difference(one, reference)]
         lines.append(tuple(cells))
     return text.markdown_table(lines)
 
@@ -148,6 +156,11 @@ def _difference(one: Group, reference: Group | None) -> str:
     mine, others = (comparing.values_by_seed(each, "successes") for each in (one, reference))
     shared = sorted(mine.keys() & others.keys())
     return _interval(np.array([mine[seed] - others[seed] for seed in shared])) if shared else ""
+
+
+def _human_time(one: Group) -> float:
+    """Return the mean human time of a group, extra demonstrations included."""
+    return float(np.mean(_values(one, "human_steps"))) + int(one.config.extra_demonstrations)
 
 
 def _values(one: Group, metric: str) -> np.ndarray:
@@ -179,7 +192,9 @@ def _panel(ax: Any, store: Store, environment: str) -> None:
         places = sorted(place for place in store.places if place[:2] == (environment, algorithm))
         found = [one for place in places if (one := store.group_of(place))]
         if found:
-            points = [[np.mean(_values(one, metric)) for one in found] for metric in ("human_steps", "successes")]
+            points = [
+                [measure(one) for one in found] for measure in (_human_time, lambda one: np.mean(_values(one, "successes")))
+            ]
             lines[algorithm] = sorted(zip(*points, strict=True))
     heights = sorted((points[-1][1], name) for name, points in lines.items())
     least = 0.035 * max(height for height, _ in heights)

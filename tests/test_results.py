@@ -6,13 +6,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import paper
 import pytest
 
 from fleetjax.io import rows
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "experiments" / "results"
-PARTS = sorted(path.stem for path in RESULTS.glob("*.csv"))
+PARTS = [name for name in paper.PARTS if (RESULTS / f"{name}.csv").exists()]
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -29,12 +30,26 @@ def free_port():
         return found.getsockname()[1]
 
 
-def command(folder, *, port, processes, process, devices, **others):
+CRITICS = {"num_critic_transitions": 200, "critic_pretraining_steps": 10, "critic_capacity": 1003}  # which 4 do not divide
+
+
+def command(
+    folder,
+    *,
+    port,
+    processes,
+    process,
+    devices,
+    environment="navigation",
+    algorithm="random",
+    program=("-m", "fleetjax"),
+    **others,
+):
     """Return a started process of a run."""
     given = SMALL | {f"--{name.replace('_', '-')}": value for name, value in others.items()}
     given |= {"--output": folder, "--coordinator": f"localhost:{port}", "--num-processes": processes, "--process-id": process}
     words = [str(word) for pair in given.items() for word in pair]
-    arguments = [sys.executable, "-m", "fleetjax", "run", "navigation", "--algorithm", "random", "--distributed", *words]
+    arguments = [sys.executable, *program, "run", environment, "--algorithm", algorithm, "--distributed", *words]
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(arguments, env=os.environ | {"XLA_FLAGS": flags, "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}, **pipes)
@@ -68,10 +83,34 @@ def wait_for_rows(folder, number):
 
 
 @pytest.mark.slow
-def test_several_processes_give_the_bits_of_one_with_as_many_devices(tmp_path):
-    one = complete(tmp_path / "one", 1, 4)
-    assert complete(tmp_path / "two", 2, 2) == one
-    assert complete(tmp_path / "four", 4, 1) == one
+@pytest.mark.parametrize(
+    "given",
+    [{}, {"algorithm": "cur", **CRITICS}, {"environment": "humanoid", "algorithm": "cur", **CRITICS}],
+    ids=["random", "critics", "physics"],
+)
+def test_several_processes_give_the_bits_of_one_with_as_many_devices(tmp_path, given):
+    one = complete(tmp_path / "one", 1, 4, **given)
+    assert complete(tmp_path / "two", 2, 2, **given) == one
+    assert complete(tmp_path / "four", 4, 1, **given) == one
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("environment", ["navigation", "humanoid"])
+def test_a_stopped_run_resumes_on_other_processes_and_on_other_devices(tmp_path, environment):
+    given = {"environment": environment, "algorithm": "cur", "num_steps": 600, **CRITICS}
+    whole = complete(tmp_path / "whole", 1, 4, **given)
+    stopped = start(tmp_path / "run", 2, 2, **given)
+    wait_for_rows(tmp_path / "run", 30)
+    stopped[1].send_signal(signal.SIGTERM)
+    for code, errors in finish(stopped):
+        assert code == 130, errors
+    shutil.copytree(tmp_path / "run", tmp_path / "fewer")
+    done = len((tmp_path / "run" / "metrics.csv").read_bytes().splitlines()) - 1
+    assert 30 <= done < 600
+    assert complete(tmp_path / "run", 1, 4, **given) == whole
+    metrics, _ = complete(tmp_path / "fewer", 2, 1, **given)  # two parts of a ring in place of four: the same until then
+    assert metrics.splitlines()[: done + 1] == whole[0].splitlines()[: done + 1]
+    assert len(metrics.splitlines()) == 601
 
 
 def only_line(errors):
@@ -119,12 +158,12 @@ def test_a_process_says_in_one_line_that_another_was_killed(lost):
 
 
 @pytest.mark.parametrize("lost", [0, 1])
-@pytest.mark.parametrize(("timeout", "silence"), [(15, 600), (600, 15)])
+@pytest.mark.parametrize(("timeout", "silence"), [(10, 600), pytest.param(600, 10, marks=pytest.mark.slow)])
 def test_a_process_says_in_one_line_that_another_hangs(lost, timeout, silence):
     started = exchanging(timeout, silence)
     started[lost].send_signal(signal.SIGSTOP)
     ((code, errors),) = finish([started[1 - lost]], timeout=60)
-    reason = "no progress for 15 s: a process hangs, or --step-timeout" if timeout == 15 else f"process {lost} is gone"
+    reason = "no progress for 10 s: a process hangs, or --step-timeout" if timeout == 10 else f"process {lost} is gone"
     assert code == 1
     assert only_line(errors).startswith(f"fleetjax: {reason}")
     started[lost].send_signal(signal.SIGCONT)  # it finds itself alone
@@ -205,6 +244,23 @@ def test_processes_that_differ_are_refused(tmp_path):
     for code, errors in finish(started):
         assert code == 2
         assert "random_threshold = 0.6 in process 1, but 0.5 in process 0" in errors
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+def test_processes_of_other_versions_are_refused(tmp_path):
+    port = free_port()
+    newer = (
+        "import sys; from fleetjax.io import folder; folder.VERSION = '99.0'; from fleetjax.cli import main; sys.exit(main())"
+    )
+    programs = [("-m", "fleetjax"), ("-c", newer)]
+    started = [
+        command(tmp_path / "run", port=port, processes=2, process=i, devices=1, program=program)
+        for i, program in enumerate(programs)
+    ]
+    for code, errors in finish(started):
+        assert code == 2
+        assert re.search(r"fleetjax: fleetjax = 99\.0 in process 1, but \S+ in process 0; start all processes", errors), errors
     assert not (tmp_path / "run").exists()
 
 

@@ -158,11 +158,12 @@ def _carry_here(here: socket.socket, there: socket.socket, left: threading.Event
 
 
 def _carry(source: socket.socket, target: socket.socket) -> None:
-    """Pass on what comes until one of them is closed."""
+    """Pass on what comes until the source is closed. What the target no longer takes is dropped."""
     target.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     with contextlib.suppress(OSError):
         while data := source.recv(LARGEST):
-            target.sendall(data)
+            with contextlib.suppress(OSError):
+                target.sendall(data)
 
 
 def _hang_up(*ends: socket.socket) -> None:

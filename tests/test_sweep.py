@@ -547,15 +547,18 @@ def test_jobs_of_a_cluster_take_over_what_dead_ones_leave(tmp_path, spawn, whole
         assert [lease["end"] for lease in leases] == [""] * (len(leases) - 1) + ["finished"]
         owners |= {lease["owner"][1] for lease in leases}
         log = (output / "logs" / f"{run.name}.log").read_text()
-        assert len(leases) == 1 or "resuming from" in log or "compiling and pre-training" in log
+        assert len(leases) == 1 or "resuming from" in log or "no checkpoint was written yet" in log
     assert set(killed) < owners
     assert len(owners) <= 4
 
 
 def working(runs: list[Path]) -> list[int]:
-    """Return the living processes that have begun runs and not finished them, by process."""
-    begun = [run for run in runs if 0 < rows(run) < LONG]
-    return sorted({process for process in map(owner, begun) if is_alive(process)})
+    """Return the living processes that have begun runs and not finished them."""
+    owners = set()
+    for run in runs:
+        with contextlib.suppress(ValueError):  # its next owner is about to write its number
+            owners |= {owner(run)} if 0 < rows(run) < LONG else set()
+    return sorted(filter(is_alive, owners))
 
 
 def test_ctrl_c_while_a_process_starts_reaches_its_parent_alone():

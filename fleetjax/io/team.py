@@ -75,8 +75,9 @@ def join(meeting: Meeting) -> None:
             given = (_relayed(host, int(port)), *given[1:])
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     jax.config.update("jax_enable_recoverability", True)  # else JAX ends this process when another one fails, with a trace
-    where = f"at {meeting.coordinator}" if meeting.coordinator else "in this environment; give --coordinator HOST:PORT"
-    message = f"the processes did not meet within {meeting.timeout} s {where}"
+    where = f"at {meeting.coordinator}" if meeting.coordinator else "in this environment"
+    remedy = "raise --connect-timeout" if meeting.coordinator else "give --coordinator HOST:PORT"
+    message = f"the processes did not meet within {meeting.timeout} s {where}; start all of them, or {remedy}"
     with _within(meeting.timeout, message):
         try:
             # When its own timeouts are over, JAX aborts the process.

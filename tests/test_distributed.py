@@ -60,7 +60,7 @@ def start(folder, processes, devices, **others):
     return [command(folder, port=port, processes=processes, process=i, devices=devices, **others) for i in range(processes)]
 
 
-def finish(started, timeout=300):
+def finish(started, timeout=900):
     """Return exit code and stderr of each process."""
     try:
         return [(process.communicate(timeout=timeout)[1], process.returncode)[::-1] for process in started]
@@ -76,7 +76,7 @@ def complete(folder, processes, devices, **others):
 
 
 def wait_for_rows(folder, number):
-    end = time.monotonic() + 240
+    end = time.monotonic() + 900
     while not (folder / "metrics.csv").exists() or len((folder / "metrics.csv").read_bytes().splitlines()) <= number:
         assert time.monotonic() < end
         time.sleep(0.1)
@@ -97,20 +97,20 @@ def test_several_processes_give_the_bits_of_one_with_as_many_devices(tmp_path, g
 @pytest.mark.slow
 @pytest.mark.parametrize("environment", ["navigation", "humanoid"])
 def test_a_stopped_run_resumes_on_other_processes_and_on_other_devices(tmp_path, environment):
-    given = {"environment": environment, "algorithm": "cur", "num_steps": 600, **CRITICS}
+    given = {"environment": environment, "algorithm": "cur", "num_steps": 150, **CRITICS}
     whole = complete(tmp_path / "whole", 1, 4, **given)
     stopped = start(tmp_path / "run", 2, 2, **given)
-    wait_for_rows(tmp_path / "run", 30)
+    wait_for_rows(tmp_path / "run", 10)
     stopped[1].send_signal(signal.SIGTERM)
     for code, errors in finish(stopped):
         assert code == 130, errors
     shutil.copytree(tmp_path / "run", tmp_path / "fewer")
     done = len((tmp_path / "run" / "metrics.csv").read_bytes().splitlines()) - 1
-    assert 30 <= done < 600
+    assert 10 < done < 150
     assert complete(tmp_path / "run", 1, 4, **given) == whole
     metrics, _ = complete(tmp_path / "fewer", 2, 1, **given)  # two parts of a ring in place of four: the same until then
     assert metrics.splitlines()[: done + 1] == whole[0].splitlines()[: done + 1]
-    assert len(metrics.splitlines()) == 601
+    assert len(metrics.splitlines()) == 151
 
 
 def only_line(errors):

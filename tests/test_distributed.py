@@ -1,6 +1,8 @@
 """One fleet on several processes: the same bits as on one with as many devices, and a clear end when one of them is gone."""
 
 import os
+import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -28,12 +30,26 @@ def free_port():
         return found.getsockname()[1]
 
 
-def command(folder, *, port, processes, process, devices, **others):
+CRITICS = {"num_critic_transitions": 200, "critic_pretraining_steps": 10, "critic_capacity": 1003}  # which 4 do not divide
+
+
+def command(
+    folder,
+    *,
+    port,
+    processes,
+    process,
+    devices,
+    environment="navigation",
+    algorithm="random",
+    program=("-m", "fleetjax"),
+    **others,
+):
     """Return a started process of a run."""
     given = SMALL | {f"--{name.replace('_', '-')}": value for name, value in others.items()}
     given |= {"--output": folder, "--coordinator": f"localhost:{port}", "--num-processes": processes, "--process-id": process}
     words = [str(word) for pair in given.items() for word in pair]
-    arguments = [sys.executable, "-m", "fleetjax", "run", "navigation", "--algorithm", "random", "--distributed", *words]
+    arguments = [sys.executable, *program, "run", environment, "--algorithm", algorithm, "--distributed", *words]
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(arguments, env=os.environ | {"XLA_FLAGS": flags, "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}, **pipes)
@@ -44,7 +60,7 @@ def start(folder, processes, devices, **others):
     return [command(folder, port=port, processes=processes, process=i, devices=devices, **others) for i in range(processes)]
 
 
-def finish(started, timeout=300):
+def finish(started, timeout=900):
     """Return exit code and stderr of each process."""
     try:
         return [(process.communicate(timeout=timeout)[1], process.returncode)[::-1] for process in started]
@@ -60,38 +76,129 @@ def complete(folder, processes, devices, **others):
 
 
 def wait_for_rows(folder, number):
-    end = time.monotonic() + 240
+    end = time.monotonic() + 900
     while not (folder / "metrics.csv").exists() or len((folder / "metrics.csv").read_bytes().splitlines()) <= number:
         assert time.monotonic() < end
         time.sleep(0.1)
 
 
 @pytest.mark.slow
-def test_several_processes_give_the_bits_of_one_with_as_many_devices(tmp_path):
-    one = complete(tmp_path / "one", 1, 4)
-    assert complete(tmp_path / "two", 2, 2) == one
-    assert complete(tmp_path / "four", 4, 1) == one
+@pytest.mark.parametrize(
+    "given",
+    [{}, {"algorithm": "cur", **CRITICS}, {"environment": "humanoid", "algorithm": "cur", **CRITICS}],
+    ids=["random", "critics", "physics"],
+)
+def test_several_processes_give_the_bits_of_one_with_as_many_devices(tmp_path, given):
+    one = complete(tmp_path / "one", 1, 4, **given)
+    assert complete(tmp_path / "two", 2, 2, **given) == one
+    assert complete(tmp_path / "four", 4, 1, **given) == one
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("environment", ["navigation", "humanoid"])
+def test_a_stopped_run_resumes_on_other_processes_and_on_other_devices(tmp_path, environment):
+    given = {"environment": environment, "algorithm": "cur", "num_steps": 150, **CRITICS}
+    whole = complete(tmp_path / "whole", 1, 4, **given)
+    stopped = start(tmp_path / "run", 2, 2, **given)
+    wait_for_rows(tmp_path / "run", 10)
+    stopped[1].send_signal(signal.SIGTERM)
+    for code, errors in finish(stopped):
+        assert code == 130, errors
+    shutil.copytree(tmp_path / "run", tmp_path / "fewer")
+    done = len((tmp_path / "run" / "metrics.csv").read_bytes().splitlines()) - 1
+    assert 10 < done < 150
+    assert complete(tmp_path / "run", 1, 4, **given) == whole
+    metrics, _ = complete(tmp_path / "fewer", 2, 1, **given)  # two parts of a ring in place of four: the same until then
+    assert metrics.splitlines()[: done + 1] == whole[0].splitlines()[: done + 1]
+    assert len(metrics.splitlines()) == 151
+
+
+def only_line(errors):
+    """Return the one line of stderr that a process ended with, but for what XLA warns of as it starts."""
+    (line,) = [line for line in errors.splitlines() if not re.match(r"W\d{4} ", line)]
+    return line
+
+
+EXCHANGE = """
+import sys, time
+from fleetjax.io import team
+port, process, timeout, silence = map(int, sys.argv[1:])
+team.SILENCE = silence
+team.join(team.Meeting(f"localhost:{port}", 2, process, 240))
+team.tell("compiled")
+with team.watched(timeout, "repeat the same command") as beat:
+    for number in range(10**9):
+        team.tell("here")
+        beat()
+        if number == 3:
+            print("under way", flush=True)
+"""
+
+
+def exchanging(timeout, silence):
+    """Return two processes that exchange something again and again."""
+    port, pipes = free_port(), {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    words = [[str(word) for word in (port, process, timeout, silence)] for process in (0, 1)]
+    started = [subprocess.Popen([sys.executable, "-c", EXCHANGE, *arguments], **pipes) for arguments in words]
+    for process in started:
+        assert any("under way" in line for line in process.stdout), finish(started)  # gloo prints lines, too
+    return started
+
+
+@pytest.mark.parametrize("lost", [0, 1])
+def test_a_process_says_in_one_line_that_another_was_killed(lost):
+    started = exchanging(timeout=600, silence=30)
+    started[lost].send_signal(signal.SIGKILL)
+    ((code, errors),) = finish([started[1 - lost]], timeout=60)
+    finish([started[lost]])
+    assert code == 1
+    line = only_line(errors)
+    assert line.startswith((f"fleetjax: process {lost} is gone; ", "fleetjax: another process is probably gone ("))
+    assert line.endswith("; repeat the same command")
+
+
+@pytest.mark.parametrize("lost", [0, 1])
+@pytest.mark.parametrize(("timeout", "silence"), [(10, 600), pytest.param(600, 10, marks=pytest.mark.slow)])
+def test_a_process_says_in_one_line_that_another_hangs(lost, timeout, silence):
+    started = exchanging(timeout, silence)
+    started[lost].send_signal(signal.SIGSTOP)
+    ((code, errors),) = finish([started[1 - lost]], timeout=60)
+    reason = "no progress for 10 s: a process hangs, or --step-timeout" if timeout == 10 else f"process {lost} is gone"
+    assert code == 1
+    assert only_line(errors).startswith(f"fleetjax: {reason}")
+    started[lost].send_signal(signal.SIGCONT)  # it finds itself alone
+    ((code, errors),) = finish([started[lost]], timeout=60)
+    assert code == 1
+    assert "is gone" in only_line(errors) or "is probably gone" in only_line(errors)
+
+
+LONG = {"num_steps": 1500, "checkpoint_every": 60}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Return what a long run gives that nobody stops."""
+    return complete(tmp_path_factory.mktemp("whole") / "run", 1, 4, **LONG)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lost", [0, 1])
-def test_a_run_whose_process_was_killed_ends_and_resumes_on_another_number_of_processes(tmp_path, lost):
-    long = {"num_steps": 1500, "checkpoint_every": 60}
-    started = start(tmp_path / "run", 2, 2, **long)
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_run_that_lost_a_process_ends_and_resumes_on_another_number_of_processes(tmp_path, whole, how, lost):
+    started = start(tmp_path / "run", 2, 2, step_timeout=600, **LONG)
     wait_for_rows(tmp_path / "run", 150)
-    started[lost].send_signal(signal.SIGKILL)
-    begun = time.monotonic()
-    code, errors = finish([started[1 - lost]], timeout=60)[0]
-    assert time.monotonic() - begun < 60
-    finish([started[lost]])
-    assert code != 0
-    if "Terminating process" not in errors:  # by JAX itself, which can be faster where process 0 is lost
-        (line,) = [line for line in errors.splitlines() if line.startswith("fleetjax:")]
-        assert "is gone" in line or "is probably gone" in line
-        assert "repeat the same command" in line
+    started[lost].send_signal(how)
+    ((code, errors),) = finish([started[1 - lost]], timeout=60)
+    assert code == 1
+    (line,) = [line for line in errors.splitlines() if line.startswith("fleetjax:")]
+    assert "is gone" in line or "is probably gone" in line
+    assert "repeat the same command" in line
+    assert "Check failure" not in errors  # by which JAX would end it
+    started[lost].send_signal(signal.SIGCONT)
+    ((code, errors),) = finish([started[lost]], timeout=60)
+    assert code == (-signal.SIGKILL if how is signal.SIGKILL else 1), errors
     assert list((tmp_path / "run" / "checkpoints").iterdir())
-    resumed = complete(tmp_path / "run", 1, 4, **long)
-    assert resumed == complete(tmp_path / "whole", 1, 4, **long)
+    assert complete(tmp_path / "run", 1, 4, **LONG) == whole
 
 
 @pytest.mark.slow
@@ -140,6 +247,23 @@ def test_processes_that_differ_are_refused(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
+def test_processes_of_other_versions_are_refused(tmp_path):
+    port = free_port()
+    newer = (
+        "import sys; from fleetjax.io import folder; folder.VERSION = '99.0'; from fleetjax.cli import main; sys.exit(main())"
+    )
+    programs = [("-m", "fleetjax"), ("-c", newer)]
+    started = [
+        command(tmp_path / "run", port=port, processes=2, process=i, devices=1, program=program)
+        for i, program in enumerate(programs)
+    ]
+    for code, errors in finish(started):
+        assert code == 2
+        assert re.search(r"fleetjax: fleetjax = 99\.0 in process 1, but \S+ in process 0; start all processes", errors), errors
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize("process", [0, 1])
 def test_a_process_that_finds_no_other_says_so(tmp_path, process):
     alone = command(tmp_path / "run", port=free_port(), processes=2, process=process, devices=1, connect_timeout=2)
@@ -164,6 +288,9 @@ def test_a_process_that_finds_no_other_says_so(tmp_path, process):
             ["--output", "x", "--coordinator", "here:1", "--num-processes", "2", "--process-id", "2"],
             "--process-id 2 must be from 0 to 1",
         ),
+        (["--output", "x", "--step-timeout", "0"], "--step-timeout 0 must be at least 1 second"),
+        (["--output", "x", "--step-timeout", "-5"], "--step-timeout -5 must be at least 1 second"),
+        (["--output", "x", "--connect-timeout", "0"], "--connect-timeout 0 must be at least 1 second"),
     ],
 )
 def test_arguments_that_cannot_be_used_are_refused(arguments, message, capsys):

@@ -1,5 +1,6 @@
 """A fleet that is divided among devices is the same fleet. The devices are eight virtual ones; see `conftest.py`."""
 
+import os
 import re
 from functools import cache, partial
 
@@ -133,6 +134,26 @@ def test_where_nothing_rounds_a_run_agrees_to_the_bit():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("algorithm", ["expert", "random", "constraint"])
+def test_a_run_of_humanoids_in_native_physics_agrees_in_what_does_not_round(algorithm):
+    num_humans = SMALL["num_robots"] if algorithm == "expert" else 8
+    given = {"num_steps": 12, "initial_period": 0, "num_humans": num_humans, "backend": "native"}
+    config, key = small(algorithm, "humanoid", **given), jax.random.key(4)
+    alone, divided = run(config, key), run(config, key, mesh=mesh_of())
+    for name, here in alone.metrics._asdict().items():
+        there = getattr(divided.metrics, name)
+        if jnp.issubdtype(here.dtype, jnp.integer):
+            np.testing.assert_array_equal(here, there, err_msg=name)
+        else:
+            np.testing.assert_allclose(here, there, rtol=1e-3, atol=1e-5, err_msg=name)
+    for part in ("humans", "resetting", "timestep"):
+        jax.tree.map(np.testing.assert_array_equal, getattr(alone.state, part), getattr(divided.state, part))
+    assert int(divided.metrics.human_steps.sum()) > 0
+    assert len(divided.state.env.obs.sharding.device_set) == DEVICES
+    np.testing.assert_allclose(alone.state.env.obs, divided.state.env.obs, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_runs_agree_in_distribution():
     config, keys = small("cur", num_steps=200), jax.random.split(jax.random.key(2), 10)
@@ -168,11 +189,23 @@ def exchanged(config):
     return sorted(COLLECTIVE.findall(text))
 
 
-@pytest.mark.parametrize("algorithm", ["random", pytest.param("cur", marks=pytest.mark.slow)])
-def test_what_devices_exchange_does_not_grow_with_the_fleet(algorithm):
-    few, many = (exchanged(small(algorithm, num_robots=n, critic_capacity=2000, human_capacity=400)) for n in (64, 128))
+@pytest.mark.parametrize(
+    ("algorithm", "environment", "number"),
+    [
+        ("random", "navigation", 11),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in [("cur", "navigation", 18), ("random", "humanoid", 11), ("cur", "humanoid", 17)]
+        ),
+    ],
+)
+def test_what_devices_exchange_does_not_grow_with_the_fleet(algorithm, environment, number):
+    given = {"critic_capacity": 2000, "human_capacity": 400}
+    few, many = (exchanged(small(algorithm, environment, num_robots=n, **given)) for n in (64, 128))
     assert few == many
     assert 0 < len(few) < 40
+    if "JAX_DISABLE_MOST_OPTIMIZATIONS" not in os.environ:  # which merge collectives
+        assert len(few) == number  # as docs/scale.md says
 
 
 def test_a_fleet_that_devices_cannot_divide_is_refused():

@@ -86,6 +86,7 @@ def _run_together(arguments: argparse.Namespace, given: Mapping[str, Any]) -> No
     begun = time.monotonic()
     with _refusing():
         resumable.check_interval(arguments.checkpoint_every)
+        team.check_step_timeout(arguments.step_timeout)
         team.join(team.Meeting(arguments.coordinator, arguments.num_processes, arguments.process_id, arguments.connect_timeout))
         run = _new_run(arguments, given)
         with sharding.over(team.mesh(), run.config.num_humans):

@@ -240,7 +240,8 @@ def _add_distribution(run: Any) -> None:
     group.add_argument("--process-id", metavar="I", type=_integer, help="which of them this is, from 0 to P - 1")
     wait = "seconds to wait for the other processes at the start [default: 60]"
     group.add_argument("--connect-timeout", metavar="S", type=_integer, default=60, help=wait)
-    hang = "end if no chunk of timesteps, about a hundredth of the run, is finished for S seconds [default: 1800]"
+    hang = "end if nothing is finished for S seconds: no compilation, checkpoint or chunk of timesteps, about a hundredth of "
+    hang += "the run; choose more than the longest of these takes [default: 1800]"
     group.add_argument("--step-timeout", metavar="S", type=_integer, default=1800, help=hang)
 
 

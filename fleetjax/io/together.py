@@ -96,6 +96,7 @@ def _run(run: folder.Run, begun: dict[str, Any], every: int, beat: Callable[[], 
         say(f"{text.headline(config, run.seed)}, on {mesh.size} devices of {processes} ...")
     state, before, notes = _start(run, begun["checkpoint"], mesh)
     saved = done = int(state.timestep)
+    beat()
     with contextlib.ExitStack() as stack:
         asked = stack.enter_context(resumable.stoppable())
         journal = stack.enter_context(contextlib.closing(Journal(run, 0))) if leads else None

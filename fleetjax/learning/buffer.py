@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from fleetjax import sharding
 from fleetjax.tree import take
 
 COUNTED = 2**30  # rows; a ring that was given more counts on from its capacity, far from the end of i32
@@ -84,9 +85,10 @@ def read(buffer: Buffer, index: jax.Array) -> Any:
     """Return the rows of a buffer at `index` i32[...], below its size; those of its parts follow each other."""
     if not buffer.added.ndim:
         return take(buffer.rows, index)
-    ends = jnp.cumsum(buffer.sizes)
+    sizes = sharding.everywhere(buffer.sizes)  # else devices would exchange something at every step of the search
+    ends = jnp.cumsum(sizes)
     part = jnp.minimum(jnp.searchsorted(ends, index, side="right"), ends.size - 1)
-    return take(buffer.rows, part * (buffer.capacity // ends.size) + index - (ends - buffer.sizes)[part])
+    return take(buffer.rows, part * (buffer.capacity // ends.size) + index - (ends - sizes)[part])
 
 
 def in_parts(ring: Buffer, parts: int) -> Buffer:

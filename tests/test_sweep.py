@@ -16,7 +16,7 @@ import pytest
 from commands import contents, refused
 
 from fleetjax import cli
-from fleetjax.io import crew, flags, folder, resumable, study, sweep
+from fleetjax.io import crew, flags, folder, place, resumable, study, sweep
 
 STEPS = 2000
 LONG = 5 * STEPS
@@ -186,6 +186,16 @@ BAD = {
     "jobs without": ((NAV, "--jobs", 2), "jobs is an option of a launcher; add launcher = 'slurm', or omit it"),
     "no jobs": ((NAV, "--launcher", "local", "--jobs", 0), "jobs = 0 must be at least 1"),
     "lease": ((NAV, "--launcher", "local", "--lease", 0), "lease = 0 must be at least 1 second"),
+    "GPU": ((NAV, "--launcher", "local", "--slurm-gpu"), "slurm_gpu is an option of launcher = 'slurm'; omit it"),
+    "no group": ((NAV, "--seeds-per-program", 0), "seeds_per_program = 0 must be at least 1"),
+    "large group": (
+        (NAV, "--seeds", 2, "--seeds-per-program", 3),
+        "seeds_per_program = 3 is more than the number of seeds, 2",
+    ),
+    "checkpoints of a group": (
+        (NAV, "--seeds", 2, "--seeds-per-program", 2, "--checkpoint-every", 100),
+        "checkpoint_every = 100 has no effect with seeds_per_program = 2: runs side by side write no checkpoints; omit one",
+    ),
     "both": ((NAV, "--launcher", "local", "--workers", 2), "workers are processes of this machine; with a launcher, give jobs"),
     "partition": (
         (NAV, "--launcher", "local", "--slurm-partition", "gpu"),
@@ -248,17 +258,60 @@ def test_a_sweep_needs_an_environment_and_a_folder_of_its_own(capsys, tmp_path):
 
 
 def test_workers_keep_their_program_and_help_others_when_it_is_done():
-    runs = list(planned("navigation", "--algorithm", "cur,uc,c", "--risk-threshold", "0.1,0.2", "--seeds", 2).values())
-    by_algorithm = {name: [run for run in runs if run.config.algorithm == name] for name in ("cur", "uc", "c")}
+    runs = planned("navigation", "--algorithm", "cur,uc,c", "--risk-threshold", "0.1,0.2", "--seeds", 2).values()
+    groups = study.groups(list(runs), 1)
+    assert groups == [(run,) for run in runs]
+    by_algorithm = {name: [group for group in groups if group[0].config.algorithm == name] for name in ("cur", "uc", "c")}
     cur, uc, c = (study.program(by_algorithm[name][0]) for name in by_algorithm)
-    assert {study.program(run) for run in by_algorithm["cur"]} == {cur}
+    assert {study.program(group) for group in by_algorithm["cur"]} == {cur}
     assert len({cur, uc, c}) == 3
-    assert crew.choose(runs, None, []) == by_algorithm["cur"][0]
-    assert crew.choose(runs, None, [cur]) == by_algorithm["uc"][0]
-    assert crew.choose(runs, uc, [cur]) == by_algorithm["uc"][0]
+    assert crew.choose(groups, None, []) == by_algorithm["cur"][0]
+    assert crew.choose(groups, None, [cur]) == by_algorithm["uc"][0]
+    assert crew.choose(groups, uc, [cur]) == by_algorithm["uc"][0]
     assert crew.choose(by_algorithm["cur"] + by_algorithm["c"], uc, [cur]) == by_algorithm["c"][0]
     assert crew.choose([*by_algorithm["c"][:1], *by_algorithm["cur"]], uc, [cur, c]) == by_algorithm["cur"][0]
     assert crew.choose(by_algorithm["cur"][3:], uc, [cur]) == by_algorithm["cur"][3]
+
+
+def test_groups_differ_in_nothing_but_their_seed():
+    runs = planned("navigation", "--risk-threshold", "0.1,0.2", "--seeds", 3)
+    groups = study.groups(list(runs.values()), 2)
+    name = "navigation-cur-risk_threshold={}-seed{}".format
+    assert [[run.folder.name for run in group] for group in groups] == [
+        [name(0.1, 0), name(0.1, 1)],
+        [name(0.1, 2)],
+        [name(0.2, 0), name(0.2, 1)],
+        [name(0.2, 2)],
+    ]
+    assert study.program(groups[0]) == study.program(groups[2]) != study.program(groups[1])
+
+
+def test_each_process_has_a_place(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1, 2, 3})
+    monkeypatch.setattr(place, "gpus", lambda: [])
+    assert place.divide(9, None) == [place.Place([core], None) for core in range(4)]
+    assert place.divide(9, 2) == [place.Place([0, 2], None), place.Place([1, 3], None)]
+    monkeypatch.setattr(place, "gpus", lambda: ["2", "5"])
+    assert place.divide(9, None) == [place.Place([0, 2], "2"), place.Place([1, 3], "5")]
+    assert place.divide(1, None) == [place.Place([0, 1, 2, 3], "2")]
+    assert [one.gpu for one in place.divide(9, 3)] == ["2", "5", "2"]
+
+
+def test_another_process_looks_for_gpus_and_one_takes_what_it_is_given(monkeypatch):
+    monkeypatch.setattr(place, "_PLUGINS", ("no_such_plugin",))
+    assert place.gpus() == []
+    monkeypatch.setattr(place, "_PLUGINS", ("jax",))  # looks in earnest, and finds none in tests on a CPU
+    monkeypatch.setattr(place, "_COUNT", "print('JAX says something'); print(2)")
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    assert place.gpus() == ["0", "1"]
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
+    assert place.gpus() == ["3", "5"]
+    monkeypatch.setattr(place, "_COUNT", "raise SystemExit(1)")
+    assert place.gpus() == []
+    place.Place(sorted(os.sched_getaffinity(0)), None).take()
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == "3,5"
+    place.Place(sorted(os.sched_getaffinity(0)), "5").take()
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == "5"
 
 
 # Other processes, which can be killed

@@ -60,8 +60,8 @@ def _is_finished(run: folder.Run) -> bool:
 def _run(runs: Sequence[folder.Run], unfinished: Sequence[bool]) -> list[str]:
     """Run all of a group from t = 0, and write what is unfinished: a smaller group would be another program."""
     begun, config, logged = time.monotonic(), runs[0].config, runs[0].logged
-    seeds = ", ".join(str(run.seed) for run in runs)
-    say(f"{text.headline(config, runs[0].seed)}, with seeds {seeds} side by side, on the {jax.default_backend().upper()} ...")
+    others = ", ".join(str(run.seed) for run in runs[1:])
+    say(f"{text.headline(config, runs[0].seed)}, beside seeds {others}, on the {jax.default_backend().upper()} ...")
     for run in runs:
         folder.prepare(run)
     keys = jnp.stack([jax.random.key(run.seed) for run in runs])

@@ -5,6 +5,7 @@ gathers them. Warp adds up in any order: the same step need not give the same bi
 """
 
 import functools
+import importlib.util
 from collections.abc import Callable
 from typing import Any
 
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 import mujoco
 from jax.custom_batching import custom_vmap
 
+from fleetjax.physics.base import check_backend
 from fleetjax.physics.contract import PhysicsState
 from fleetjax.physics.mjx import advance, keep, mjx
 
@@ -57,10 +59,22 @@ def make_step(model: mujoco.MjModel, substeps: int) -> Callable[[PhysicsState, j
         return after, jax.tree.map(lambda _: True, after)
 
     def step(state: PhysicsState, control: jax.Array, active: jax.Array) -> PhysicsState:
+        if not importlib.util.find_spec("warp"):  # a fleet can be described, and its files read, without it
+            return jax.pure_callback(_refuse, state, state, vmap_method="broadcast_all")
         alone = jax.tree.map(lambda x: jnp.asarray(x)[None], (state, control, active))
         return jax.tree.map(lambda x: x[0], step_all(*alone))
 
     return step
+
+
+def _refuse(state: PhysicsState) -> PhysicsState:
+    """Refuse to step.
+
+    Raises:
+        ValueError: with what is missing.
+    """
+    check_backend("warp")
+    return state
 
 
 def _lost_contacts(data: Any) -> jax.Array:

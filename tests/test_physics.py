@@ -128,7 +128,7 @@ def test_warp_steps_fleets_side_by_side_and_contains_divergence():
     others = ~sick & (np.arange(NUM_ROBOTS) > 0)
     close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-3)
     jax.tree.map(close, rows(after, others), rows(healthy, others))
-    halves = jax.tree.map(lambda x: x.reshape(2, -1, *x.shape[1:]), (states, controls, np.ones(NUM_ROBOTS, bool)))
+    halves = jax.tree.map(lambda x: x.reshape(2, NUM_ROBOTS // 2, *x.shape[1:]), (states, controls, np.ones(NUM_ROBOTS, bool)))
     two_fleets = jax.jit(jax.vmap(jax.vmap(physics_of(QUICK, "warp").step)))(*halves)
     again = jax.tree.map(lambda x: np.reshape(x, (NUM_ROBOTS, *x.shape[2:])), two_fleets)
     jax.tree.map(close, again, healthy)

@@ -5,6 +5,7 @@ gathers them. Warp adds up in any order: the same step need not give the same bi
 """
 
 import functools
+import importlib
 import importlib.util
 from collections.abc import Callable
 from typing import Any
@@ -27,8 +28,7 @@ def make_step(model: mujoco.MjModel, substeps: int) -> Callable[[PhysicsState, j
 
     @functools.cache
     def on_device() -> Any:
-        import warp
-
+        warp = importlib.import_module("warp")
         warp.config.log_level = warp.LOG_WARNING  # else it prints on stdout which kernels it loads
         with jax.ensure_compile_time_eval():
             put = mjx.put_model(model, impl="warp")

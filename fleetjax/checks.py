@@ -17,6 +17,7 @@ from fleetjax.learning import imitation
 from fleetjax.learning.buffer import Buffer, is_buffer
 from fleetjax.learning.networks import Normalizer
 from fleetjax.metrics import Metrics
+from fleetjax.physics.base import check_backend
 from fleetjax.precision import in_32_bits
 
 _GIB = 2**30
@@ -48,8 +49,16 @@ def check_run(config: Config, env: Env | None = None, state: FleetState | None =
         state: the state to start from, if there is one.
 
     Raises:
-        ValueError: if the configuration is not valid, the run cannot fit the memory, or it cannot start from the state.
+        ValueError: if the configuration is not valid, this process cannot use the backend, the run cannot fit the memory, or
+            it cannot start from the state.
     """
+    env = check_plan(config, env, state)
+    check_backend(config.backend)
+    return env
+
+
+def check_plan(config: Config, env: Env | None = None, state: FleetState | None = None) -> Env:
+    """Check as `check_run` does, but for the backend: another process, which may have a GPU, computes the run."""
     validate(config, env)
     check_mesh(config)
     env = env or envs.make(config.environment, config.backend)

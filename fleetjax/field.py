@@ -66,7 +66,7 @@ class Fields:
     environment: str = _static("humanoid", "name of the environment")
     algorithm: str = _static("cur", "name of the algorithm, or an order of the letters c, u, r")
     supervisor: str = _static("", "name of the supervisor; empty = the environment's own")
-    backend: str = _static("auto", "physics backend: native (CPU threads), mjx (pure JAX), auto")
+    backend: str = _static("auto", "physics backend: native (CPU threads), mjx (pure JAX), warp (NVIDIA GPU), auto")
     allocation: str = _static("hard", "hard, or soft: relaxed for derivatives (algorithms with differentiable scores)")
     human_model: str = _static("perfect", "name of the model of humans: perfect, or imperfect, which has parameters below")
     link_model: str = _static("perfect", "connections to the robots: perfect, gilbert_elliott, unequal, swapping")

@@ -1,6 +1,7 @@
 """Physics: MuJoCo to the bit on the native backend, MJX close to it, and robots that leave each other alone."""
 
 import functools
+import importlib.util
 import subprocess
 import sys
 
@@ -9,13 +10,15 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from agreement import NUM_ROBOTS, assert_agree_with_native, mixed, mover, recorded, rows
+from commands import refused
 from compiling import compiled
-from record_states import DATA, ROBOTS, count_contacts, make_policy, physics_of
+from record_states import ROBOTS, count_contacts, make_policy, physics_of
 
+import fleetjax
 from fleetjax.physics import mjx, native
-from fleetjax.physics.base import PhysicsState, make_physics, resolve_backend
+from fleetjax.physics.base import PhysicsState, check_backend, make_physics, resolve_backend
 
-NUM_ROBOTS = 32  # of every batch, so that MJX compiles once
 BACKENDS = ("native", "mjx")
 QUICK = "anymal"  # MJX takes long to compile a robot, and this one least of all: the others are among the slow tests
 
@@ -39,35 +42,6 @@ each_robot_and_backend = pytest.mark.parametrize(
         for backend in BACKENDS
     ],
 )
-
-
-@functools.cache
-def mover(name: str, backend: str):
-    """Return `(states, controls, active) -> states` of a batch of robots."""
-    step = compiled(jax.vmap(physics_of(name, backend).step))
-
-    def move(states: PhysicsState, control, active=True) -> PhysicsState:
-        return jax.tree.map(np.asarray, step(states, control, jnp.broadcast_to(active, NUM_ROBOTS)))
-
-    return move
-
-
-@functools.cache
-def recorded(name: str) -> tuple[PhysicsState, np.ndarray]:
-    """128 states before a violation, the first half of them with three contacts or more, and controls for each."""
-    with np.load(DATA / f"{name}_states.npz") as arrays:
-        fields = dict(arrays)
-    control = fields.pop("control")
-    return PhysicsState(**fields), control
-
-
-def rows(tree, index):
-    return jax.tree.map(lambda x: x[index], tree)
-
-
-def mixed(name: str):
-    """Recorded states, half of each kind, and their controls, enough for a batch."""
-    return rows(recorded(name), slice(64 - NUM_ROBOTS // 2, 64 + NUM_ROBOTS // 2))
 
 
 def assert_same(tree, other):
@@ -123,36 +97,41 @@ def test_the_number_of_threads_changes_no_bit(name, monkeypatch):
         assert_same(after, expected)
 
 
-# Median and 95th percentile that the largest error of a robot must stay below: three times what was measured, and three (the
-# hand) to ten times.
-BOUNDS = {  # m and rad; m/s and rad/s; N and N m; m/s^2 and rad/s^2
-    "humanoid": {"qpos": (3e-6, 2e-4), "qvel": (2e-4, 2e-2), "sensors": (2e-2, 15.0), "warmstart": (3e-2, 5.0)},
-    "anymal": {"qpos": (1e-6, 2e-5), "qvel": (5e-5, 2e-3), "warmstart": (6e-3, 3e-1)},
-    "allegro_hand": {"qpos": (4e-4, 5e-2), "qvel": (3e-2, 5.0), "warmstart": (1.5, 7e2)},
-}
+@pytest.mark.slow
+@each_robot
+def test_mjx_agrees_with_native(name):
+    """The tail is wide: a few states lie where a contact or a joint limit opens within rounding, or where the two engines place
+    the contacts of a box differently, or where two solvers, stopped after few iterations, stand at different points.
+    """
+    assert_agree_with_native(name, "mjx")
 
 
 @pytest.mark.slow
 @each_robot
-def test_mjx_agrees_with_native(name):
-    """One control step; the largest error of a robot, over robots: median and 95th percentile.
+def test_warp_agrees_with_native(name):
+    """On a CPU, too, though users need a GPU for it: there Warp is slow."""
+    pytest.importorskip("warp", reason='needs pip install "fleetjax[warp]"')
+    assert_agree_with_native(name, "warp")
 
-    The tail is wide: a few states lie where a contact or a joint limit opens within rounding, or where the two engines place
-    the contacts of a box differently, or where two solvers, stopped after few iterations, stand at different points.
-    """
-    states, controls = recorded(name)
-    errors = {field: [] for field in BOUNDS[name]}
-    for batch in np.split(np.arange(len(controls)), len(controls) // NUM_ROBOTS):
-        one, other = (mover(name, backend)(rows(states, batch), controls[batch]) for backend in BACKENDS)
-        np.testing.assert_allclose(one.time, other.time, rtol=1e-6)
-        for field, found in errors.items():
-            found.append(np.abs(getattr(one, field) - getattr(other, field)).max(axis=1))
-    for field, (median, tail) in BOUNDS[name].items():
-        error = np.concatenate(errors[field])
-        typical, rare = np.quantile(error, [0.5, 0.95])
-        print(f"{name} {field}: median {typical:.1e}, 95th percentile {rare:.1e}, largest {error.max():.1e}")
-        assert typical < median, field
-        assert rare < tail, field
+
+@pytest.mark.slow
+def test_warp_steps_fleets_side_by_side_and_contains_divergence():
+    pytest.importorskip("warp", reason='needs pip install "fleetjax[warp]"')
+    states, controls = mixed(QUICK)
+    healthy = mover(QUICK, "warp")(states, controls)
+    sick_states, sick_controls = infect(states, controls)
+    after = mover(QUICK, "warp")(sick_states, sick_controls, np.arange(NUM_ROBOTS) != 0)
+    sick = np.isin(np.arange(NUM_ROBOTS), list(SICK.values()))
+    np.testing.assert_array_equal(after.diverged, sick)
+    assert_same(rows(after._replace(diverged=sick_states.diverged), sick), rows(sick_states, sick))
+    assert_same(rows(after, 0), rows(states, 0))
+    others = ~sick & (np.arange(NUM_ROBOTS) > 0)
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-3)
+    jax.tree.map(close, rows(after, others), rows(healthy, others))
+    halves = jax.tree.map(lambda x: x.reshape(2, NUM_ROBOTS // 2, *x.shape[1:]), (states, controls, np.ones(NUM_ROBOTS, bool)))
+    two_fleets = jax.jit(jax.vmap(jax.vmap(physics_of(QUICK, "warp").step)))(*halves)
+    again = jax.tree.map(lambda x: np.reshape(x, (NUM_ROBOTS, *x.shape[2:])), two_fleets)
+    jax.tree.map(close, again, healthy)
 
 
 @functools.cache
@@ -321,8 +300,34 @@ def test_mjx_is_differentiable_forwards():
 
 def test_backends_are_resolved():
     assert resolve_backend("auto") == ("native" if jax.default_backend() == "cpu" else "mjx")
-    with pytest.raises(ValueError, match="backend = 'cuda' is unknown; choose one of auto, native, mjx"):
+    with pytest.raises(ValueError, match="backend = 'cuda' is unknown; choose one of auto, native, mjx, warp"):
         make_physics("humanoid.xml", substeps=3, backend="cuda")
+
+
+def test_warp_is_refused_without_a_gpu_before_anything_is_computed(capsys, tmp_path, monkeypatch):
+    remedy = r"backend = 'warp' needs an NVIDIA GPU and pip install \"fleetjax\[cuda12,warp\]\" \(.*{}.*\); or choose"
+    for gpu, installed, missing in (
+        (False, False, "JAX finds no GPU here and warp-lang is not installed"),
+        (False, True, "JAX finds no GPU here"),
+        (True, False, "warp-lang is not installed"),
+    ):
+        monkeypatch.setattr(jax, "default_backend", lambda gpu=gpu: "gpu" if gpu else "cpu")
+        monkeypatch.setattr(importlib.util, "find_spec", lambda name, found=installed: found or None)
+        with pytest.raises(ValueError, match=remedy.format(missing)):
+            check_backend("warp")
+    config = fleetjax.make_config("humanoid", backend="warp")  # a run can be described, and read, anywhere
+    with pytest.raises(ValueError, match="backend = 'warp' needs an NVIDIA GPU"):
+        jax.eval_shape(fleetjax.run, config, jax.random.key(0))
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: True)
+    check_backend("warp")
+    monkeypatch.undo()
+    if not importlib.util.find_spec("warp"):
+        step, states = jax.jit(physics_of("humanoid", "warp").step), rows(recorded("humanoid")[0], 0)
+        with pytest.raises(jax.errors.JaxRuntimeError, match="backend = 'warp' needs an NVIDIA GPU"):
+            jax.block_until_ready(step(states, jnp.zeros(21), jnp.ones((), bool)))
+    said = refused(capsys, "run", "navigation", "--backend", "warp", "--output", tmp_path / "out")
+    assert "backend = 'warp' needs an NVIDIA GPU" in said
+    assert not (tmp_path / "out").exists()
 
 
 def test_native_refuses_implicit_damping():

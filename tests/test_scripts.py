@@ -108,8 +108,12 @@ CASES = {
         (row("navigation", r"\d+", r"[\d,]+", r"[\d.]+", r"-?[\d,]+", r"[\d,]+"), row("8", r"\d+", r"[\d.]+", r"[\d.]+")),
     ),
     "benchmarks/physics.py": Case(
-        ("humanoid --num-robots 4 --largest-mjx 0 --repeats 1",),
+        ("humanoid --num-robots 4 --backends native --repeats 1",),
         (row("humanoid", "4", "raw rollout", r"[\d,]+", "1.00"), row("humanoid", "4", "native", r"[\d,]+", r"[\d.]+")),
+    ),
+    "benchmarks/profile_step.py": Case(
+        (f"navigation --steps 2 --repeats 1 --trace trace -- {FLEET}",),
+        (row("navigation", r"\w+", r"\d+", *[r"\d+\.\d\d"] * 8),),
     ),
     "benchmarks/scaling.py": Case(
         ("--environments navigation --num-robots 2 --num-seeds 1 --largest-navigation 10",),

@@ -17,7 +17,8 @@ import pytest
 from commands import contents, refused
 
 from fleetjax import cli
-from fleetjax.io import crew, flags, folder, resumable, study, sweep
+from fleetjax.io import chunks, crew, files, flags, folder, group, metrics_csv, place, resumable, study, sweep
+from fleetjax.io.errors import Diverged
 
 STEPS = 2000
 LONG = 5 * STEPS
@@ -187,6 +188,16 @@ BAD = {
     "jobs without": ((NAV, "--jobs", 2), "jobs is an option of a launcher; add launcher = 'slurm', or omit it"),
     "no jobs": ((NAV, "--launcher", "local", "--jobs", 0), "jobs = 0 must be at least 1"),
     "lease": ((NAV, "--launcher", "local", "--lease", 0), "lease = 0 must be at least 1 second"),
+    "GPU": ((NAV, "--launcher", "local", "--slurm-gpu"), "slurm_gpu is an option of launcher = 'slurm'; omit it"),
+    "no group": ((NAV, "--seeds-per-program", 0), "seeds_per_program = 0 must be at least 1"),
+    "large group": (
+        (NAV, "--seeds", 2, "--seeds-per-program", 3),
+        "seeds_per_program = 3 is more than the number of seeds, 2",
+    ),
+    "checkpoints of a group": (
+        (NAV, "--seeds", 2, "--seeds-per-program", 2, "--checkpoint-every", 100),
+        "checkpoint_every = 100 has no effect with seeds_per_program = 2: runs side by side write no checkpoints; omit one",
+    ),
     "both": ((NAV, "--launcher", "local", "--workers", 2), "workers are processes of this machine; with a launcher, give jobs"),
     "partition": (
         (NAV, "--launcher", "local", "--slurm-partition", "gpu"),
@@ -249,17 +260,162 @@ def test_a_sweep_needs_an_environment_and_a_folder_of_its_own(capsys, tmp_path):
 
 
 def test_workers_keep_their_program_and_help_others_when_it_is_done():
-    runs = list(planned("navigation", "--algorithm", "cur,uc,c", "--risk-threshold", "0.1,0.2", "--seeds", 2).values())
-    by_algorithm = {name: [run for run in runs if run.config.algorithm == name] for name in ("cur", "uc", "c")}
+    runs = planned("navigation", "--algorithm", "cur,uc,c", "--risk-threshold", "0.1,0.2", "--seeds", 2).values()
+    groups = study.groups(list(runs), 1)
+    assert groups == [(run,) for run in runs]
+    by_algorithm = {name: [group for group in groups if group[0].config.algorithm == name] for name in ("cur", "uc", "c")}
     cur, uc, c = (study.program(by_algorithm[name][0]) for name in by_algorithm)
-    assert {study.program(run) for run in by_algorithm["cur"]} == {cur}
+    assert {study.program(group) for group in by_algorithm["cur"]} == {cur}
     assert len({cur, uc, c}) == 3
-    assert crew.choose(runs, None, []) == by_algorithm["cur"][0]
-    assert crew.choose(runs, None, [cur]) == by_algorithm["uc"][0]
-    assert crew.choose(runs, uc, [cur]) == by_algorithm["uc"][0]
+    assert crew.choose(groups, None, []) == by_algorithm["cur"][0]
+    assert crew.choose(groups, None, [cur]) == by_algorithm["uc"][0]
+    assert crew.choose(groups, uc, [cur]) == by_algorithm["uc"][0]
     assert crew.choose(by_algorithm["cur"] + by_algorithm["c"], uc, [cur]) == by_algorithm["c"][0]
     assert crew.choose([*by_algorithm["c"][:1], *by_algorithm["cur"]], uc, [cur, c]) == by_algorithm["cur"][0]
     assert crew.choose(by_algorithm["cur"][3:], uc, [cur]) == by_algorithm["cur"][3]
+
+
+def test_groups_differ_in_nothing_but_their_seed():
+    runs = planned("navigation", "--risk-threshold", "0.1,0.2", "--seeds", 3)
+    groups = study.groups(list(runs.values()), 2)
+    name = "navigation-cur-risk_threshold={}-seed{}".format
+    assert [[run.folder.name for run in group] for group in groups] == [
+        [name(0.1, 0), name(0.1, 1)],
+        [name(0.1, 2)],
+        [name(0.2, 0), name(0.2, 1)],
+        [name(0.2, 2)],
+    ]
+    assert study.program(groups[0]) == study.program(groups[2]) != study.program(groups[1])
+
+
+def test_each_process_has_a_place(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1, 2, 3})
+    monkeypatch.setattr(place, "gpus", list)
+    assert place.divide(9, None) == [place.Place([core], None) for core in range(4)]
+    assert place.divide(9, 2) == [place.Place([0, 2], None), place.Place([1, 3], None)]
+    monkeypatch.setattr(place, "gpus", lambda: ["2", "5"])
+    assert place.divide(9, None) == [place.Place([0, 2], "2"), place.Place([1, 3], "5")]
+    assert place.divide(1, None) == [place.Place([0, 1, 2, 3], "2")]
+    assert [one.gpu for one in place.divide(9, 3)] == ["2", "5", "2"]
+
+
+def test_another_process_looks_for_gpus_and_one_takes_what_it_is_given(monkeypatch):
+    monkeypatch.setattr(place, "_PLUGINS", ("no_such_plugin",))
+    assert place.gpus() == []
+    monkeypatch.setattr(place, "_PLUGINS", ("jax",))  # looks in earnest, and finds none in tests on a CPU
+    monkeypatch.setattr(place, "_COUNT", "print('JAX says something'); print(2)")
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    assert place.gpus() == ["0", "1"]
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
+    assert place.gpus() == ["3", "5"]
+    monkeypatch.setattr(place, "_COUNT", "raise SystemExit(1)")
+    assert place.gpus() == []
+    place.Place(sorted(os.sched_getaffinity(0)), None).take()
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == "3,5"
+    place.Place(sorted(os.sched_getaffinity(0)), "5").take()
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == "5"
+
+
+# Seeds side by side
+
+EXPERT = ("--algorithm", "expert", "--num-robots", 2, "--num-humans", 2, "--hard-reset-time", 2, "--num-demonstrations", 20)
+EXPERT += ("--hidden-sizes", 8, "--batch-size", 8, "--min-teleop-time", "3,5", "--seeds", 2)
+
+
+def groups_of(*arguments: object, output: Path) -> list[study.Group]:
+    return study.groups(list(planned(NAV, *arguments, output=output).values()), 2)
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """Metrics[T] of plain runs of the expert, by the number of timesteps and the name of the run."""
+    found = {}
+    for steps in (40, LONG):
+        output = tmp_path_factory.mktemp("alone")
+        runs = planned(NAV, *EXPERT, "--num-steps", steps, output=output)
+        found[steps] = {name: resumable.complete(run, checkpoint_every=0) for name, run in runs.items()}
+    return found
+
+
+def assert_agree(path: Path, metrics) -> None:
+    """Check that a run has these Metrics[T]: no robot's state rounds, only their sum of rewards."""
+    run = folder.read_run(path)
+    found = folder.read_finished(run)
+    for name, one, other in zip(found._fields, found, metrics, strict=True):
+        if name in metrics_csv.REALS:
+            np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5)
+        else:
+            np.testing.assert_array_equal(one, other)
+
+
+def test_seeds_side_by_side_are_ordinary_runs(tmp_path, alone, monkeypatch, capsys):
+    first, second = groups_of(*EXPERT, "--num-steps", 40, output=tmp_path)
+    assert group.complete(first, checkpoint_every=0) == group.complete(second, checkpoint_every=0) == ["", ""]
+    for run in (*first, *second):
+        assert set(contents(run.folder)) == {"config.json", "metrics.csv", "figure.png"}
+        assert sweep.is_finished(run)
+        assert_agree(run.folder, alone[40][run.folder.name])
+    before = everything(tmp_path)
+    shutil.rmtree(first[1].folder)
+    assert group.complete(first, checkpoint_every=0) == ["", ""]  # once more, but what was there stays as it was
+    assert everything(tmp_path) == before
+    monkeypatch.setattr(chunks, "start", lambda *args, **kwargs: pytest.fail("nothing is left to compute"))
+    assert group.complete(first, checkpoint_every=0) == ["", ""]
+    assert "beside seeds 1, on the CPU" in capsys.readouterr().err
+
+
+def test_one_run_of_a_group_may_fail(tmp_path, alone, monkeypatch):
+    group_of_two = groups_of(*EXPERT, "--num-steps", 40, output=tmp_path)[0]
+
+    def check(chunk, timestep, run):
+        if run.seed == 0 and timestep >= 10:
+            raise Diverged("the policy is no longer finite")
+
+    monkeypatch.setattr(resumable, "check_finite", check)
+    assert group.complete(group_of_two, checkpoint_every=0) == ["the policy is no longer finite", ""]
+    one, other = group_of_two
+    assert rows(one.folder) == 10
+    assert not sweep.is_finished(one)
+    assert_agree(other.folder, alone[40][other.folder.name])
+
+
+def test_a_group_that_was_stopped_starts_again(tmp_path, alone, monkeypatch):
+    group_of_two = groups_of(*EXPERT, "--num-steps", 40, output=tmp_path)[0]
+    with monkeypatch.context() as patched:
+        patched.setattr(resumable, "stoppable", lambda: contextlib.nullcontext(lambda: True))
+        with pytest.raises(KeyboardInterrupt, match="at t = 2 of 40; runs side by side start again at t = 0"):
+            group.complete(group_of_two, checkpoint_every=0)
+    assert [rows(run.folder) for run in group_of_two] == [2, 2]
+    with files.lock(group_of_two[1].folder), pytest.raises(BlockingIOError):
+        group.complete(group_of_two, checkpoint_every=0)
+    assert group.complete(group_of_two, checkpoint_every=0) == ["", ""]
+    for run in group_of_two:
+        assert_agree(run.folder, alone[40][run.folder.name])
+
+
+def test_a_folder_keeps_its_number_of_seeds_per_program(capsys, tmp_path):
+    output = tmp_path / "out"
+    command = ("sweep", NAV, *EXPERT, "--num-steps", 40, "--output", output)
+    asked = study.make_study([NAV], vars(flags.parse([*map(str, command)])))
+    output.mkdir()
+    (output / sweep.FILE).write_text(json.dumps({"runs": asked.blocks, "log_interventions": False}))
+    said = refused(capsys, *command, "--seeds-per-program", 2)
+    assert f"seeds_per_program = 2, but the sweep in {output} has 1, and its runs would round differently" in said
+
+
+@pytest.mark.slow
+def test_seeds_side_by_side_learn_and_log(tmp_path):
+    log = ("--num-steps", 40, "--seeds", 2, "--log-interventions")
+    (runs,) = groups_of("--algorithm", "random", "--random-threshold", "0.5", *TINY[:4], *TINY[6:-2], *log, output=tmp_path)
+    assert group.complete(runs, checkpoint_every=0) == ["", ""]
+    for run in map(folder.read_run, [run.folder for run in runs]):
+        metrics = folder.read_finished(run)
+        assert np.all(metrics.moving + metrics.idle == 2)
+        assert np.all(metrics.human_steps <= 2)
+        assert sum(map(len, folder.read_interventions(run))) == metrics.teleop_steps.sum() > 0
+        assert folder.read_policy(run) is not None
+    one, other = (folder.read_policy(folder.read_run(run.folder)).params for run in runs)
+    assert not any(map(np.array_equal, jax.tree.leaves(one), jax.tree.leaves(other)))
 
 
 # Other processes, which can be killed
@@ -480,6 +636,29 @@ def test_a_run_that_fails_is_told_and_the_others_go_on(tmp_path, spawn, whole):
     code, _, said = end(spawn(*command))
     assert (code, said[0]) == (0, "3 runs, 2 of them finished already")
     assert results(damaged) == whole[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [("--workers", 1), ("--launcher", "local", "--jobs", 2, "--lease", 3)])
+def test_groups_survive_kills(tmp_path, spawn, alone, options):
+    output = tmp_path / "out"
+    command = ("sweep", NAV, *EXPERT, "--num-steps", LONG, "--seeds-per-program", 2, *options, "--output", output)
+    one, other = (output / f"navigation-expert-min_teleop_time=3-seed{seed}" for seed in (0, 1))
+    process = spawn(*command)
+    with contextlib.ExitStack() as stack:
+        stack.callback(process.kill)
+        wait_until(lambda: rows(one) > 200 and rows(other) > 200, process)
+        assert owner(one) == owner(other)
+        os.kill(owner(one), signal.SIGKILL)
+        code, _, said = end(process)
+    if "--launcher" not in options:
+        assert code == 1
+        assert sum("its worker ended (SIGKILL); its log is" in line for line in said) == 2
+        code, _, said = end(spawn(*command))
+        assert said[0] == "4 runs, 2 of them finished already"
+    assert code == 0, said
+    for name, metrics in alone[LONG].items():
+        assert_agree(output / name, metrics)
 
 
 @pytest.mark.slow

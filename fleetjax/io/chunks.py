@@ -1,8 +1,9 @@
 """Run in chunks of timesteps, so that there is something to show and to keep before the end."""
 
+import functools
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -58,12 +59,29 @@ def chunks_of(num_steps: int, length: int) -> list[int]:
     return [*chunks[:-2], chunks[-2] + 1] if rest == 1 and full else chunks
 
 
+def _prepare(config: Config, key: jax.Array) -> FleetState:
+    """Return what `prepare` does; of several keys, the states of as many fleets."""
+    return jax.vmap(prepare, in_axes=(None, 0))(config, key) if key.ndim else prepare(config, key)
+
+
+def _simulate(config: Config, key: jax.Array, state: FleetState, *, mesh: Mesh | None = None, logged: bool) -> Any:
+    """Return what `simulate` does; of several keys, with the fleets side by side."""
+    one = functools.partial(simulate, mesh=mesh, logged=logged)
+    return jax.vmap(one, in_axes=(None, 0, 0))(config, key, state) if key.ndim else one(config, key, state)
+
+
 # The state's memory is used again: buffers can be large.
-_advance = jax.jit(simulate, static_argnames=("mesh", "logged"), donate_argnames="state")
+_advance = jax.jit(_simulate, static_argnames=("mesh", "logged"), donate_argnames="state")
 
 
 def start(config: Config, key: jax.Array, length: int, *, logged: bool = False) -> FleetState:
     """Pre-train, and compile the first chunk of `length` timesteps meanwhile. Keyboard interrupts come through at once.
+
+    Args:
+        config: configuration.
+        key: the key of the run, or [K] keys of runs side by side; what is returned then has a leading axis K.
+        length: timesteps of the first chunk.
+        logged: whether interventions will be logged.
 
     Returns:
         FleetState: the state at t = 0; `run_chunks` from it finds its program compiled.
@@ -71,7 +89,7 @@ def start(config: Config, key: jax.Array, length: int, *, logged: bool = False) 
     first = config.replace(num_steps=min(length, config.num_steps))
     pool = ThreadPoolExecutor(2)  # this thread only waits: an interrupt within JAX's own code could get lost
     try:
-        lowered = pool.submit(lambda: jax.jit(prepare).lower(config, key)).result()
+        lowered = pool.submit(lambda: jax.jit(_prepare).lower(config, key)).result()
         state = pool.submit(lambda: jax.block_until_ready(lowered.compile()(config, key)))
         pool.submit(lambda: _advance.lower(first, key, lowered.out_info, logged=logged).compile()).result()
         return state.result()
@@ -92,14 +110,15 @@ def run_chunks(
 
     Args:
         config: configuration.
-        key: the key of the whole run, the same for each chunk.
+        key: the key of the whole run, the same for each chunk; or [K] keys of runs side by side.
         state: where to start; its memory is taken over.
         lengths: timesteps of each chunk.
         logged: whether to log interventions.
         mesh: over which the state is divided; None = it is not.
 
     Yields:
-        Chunk in numpy arrays and the state behind it, valid until the next one is asked for.
+        Chunk in numpy arrays and the state behind it, valid until the next one is asked for. Several keys give both a
+            leading axis K.
     """
     for length in lengths:
         (metrics, state), interventions = _advance(config.replace(num_steps=length), key, state, mesh=mesh, logged=logged)

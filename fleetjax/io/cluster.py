@@ -10,7 +10,7 @@ import uuid
 from collections.abc import Sequence
 from typing import Any
 
-from fleetjax.io import crew, study
+from fleetjax.io import crew, place, study
 from fleetjax.io.folder import Run
 from fleetjax.io.job import LEASES, Job
 from fleetjax.io.lease import Leases
@@ -51,14 +51,14 @@ class Jobs:
 
     Args:
         asked: the sweep.
-        waiting: runs to complete.
+        waiting: groups of runs to complete.
     """
 
-    def __init__(self, asked: study.Study, waiting: Sequence[Run]):
+    def __init__(self, asked: study.Study, waiting: Sequence[study.Group]):
         submitit = _submitit()
         assert asked.launcher
         launcher, name = asked.launcher, uuid.uuid4().hex[:12]
-        self._kind, self._left, self._stopping = launcher.kind, list(waiting), False
+        self._kind, self._left, self._stopping = launcher.kind, [run for group in waiting for run in group], False
         self._leases = Leases(asked.output / LEASES, name, launcher.lease)
         self._log = asked.output / FOLDER
         executor = submitit.AutoExecutor(folder=self._log, cluster=launcher.kind, slurm_max_num_timeout=_REQUEUES)
@@ -66,11 +66,16 @@ class Jobs:
         if launcher.kind == "slurm":
             common |= {"slurm_signal_delay_s": _WARNING}
             common |= {"slurm_partition": launcher.partition} if launcher.partition else {}
+            common |= {"gpus_per_node": 1} if launcher.gpu else {}
         executor.update_parameters(**common)
-        plain, local = study.to_plain(asked), launcher.kind == "local"
-        number = min(launcher.jobs, len(waiting))
+        plain, number = study.to_plain(asked), min(launcher.jobs, len(waiting))
+        if launcher.kind == "local":
+            found = place.gpus() or [None]
+            places = [(i, found[i % len(found)]) for i in range(number)]
+        else:
+            places = [(None, None)] * number  # the scheduler gives what it gives
         with crew.deaf_to_ctrl_c():
-            self._jobs = [executor.submit(Job(plain, name, i if local else None, launcher.lease)) for i in range(number)]
+            self._jobs = [executor.submit(Job(plain, name, core, gpu, launcher.lease)) for core, gpu in places]
 
     @property
     def busy(self) -> list[Run]:

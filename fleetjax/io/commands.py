@@ -158,6 +158,7 @@ def _report(run: folder.Run, metrics: Metrics, last: str) -> None:
 
 def run_sweep(arguments: argparse.Namespace) -> None:
     """Run every combination of several values."""
+    sweep.leave_gpus_to_workers()
     with _refusing():
         subjects = [name for names in arguments.subjects for name in names]
         asked = study.make_study(subjects, vars(arguments))

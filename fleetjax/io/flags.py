@@ -257,11 +257,15 @@ def _add_sweep(commands: Any, environment: str | None) -> None:
     sweep.add_argument("--seeds", metavar="N", type=_integer, help="as many seeds: 0 to N - 1 [default: 1]", **options)
     sweep.add_argument("--seed", metavar="N,...", type=listed(_seed), help="these seeds", **options)
     sweep.add_argument("--output", metavar="DIR", type=Path, help="folder for the run folders", **options)
-    workers = "processes, which share the cores [default: one for each core]"
+    workers = "processes, which share the cores [default: one for each GPU; without GPUs, one for each core]"
     sweep.add_argument("--workers", metavar="W", type=_integer, help=workers, **options)
+    together = "compute K seeds side by side in one program, without checkpoints; they round differently [default: 1]"
+    sweep.add_argument("--seeds-per-program", metavar="K", type=_integer, help=together, **options)
     launcher = "complete the sweep by one-core jobs: local = on this machine, slurm = on a cluster; replaces --workers"
     sweep.add_argument("--launcher", choices=LAUNCHERS, help=launcher, **options)
     sweep.add_argument("--jobs", metavar="J", type=_integer, help="number of jobs [default: 1]", **options)
+    gpu = "ask for one GPU for each job"
+    sweep.add_argument("--slurm-gpu", action="store_true", help=gpu, **options)
     sweep.add_argument("--slurm-partition", metavar="P", help="SLURM partition [default: the cluster's]", **options)
     term = "take over the run of a job that has shown no sign of life for S seconds [default: 180]"
     sweep.add_argument("--lease", metavar="S", type=_integer, help=term, **options)

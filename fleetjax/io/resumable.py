@@ -127,7 +127,7 @@ def run_in_folder(run: folder.Run, *, resume: bool, checkpoint_every: int) -> Me
                     journal.create(run)
                 journal.append(chunk)
                 show(chunk.metrics)
-                _check(chunk.metrics, journal.timestep, run)
+                check_finite(chunk.metrics, journal.timestep, run)
                 stopping = asked_to_stop() and journal.timestep < total
                 if stopping or journal.is_due:
                     journal.save(state)
@@ -218,7 +218,7 @@ def under_versions_of_today(run: folder.Run, timestep: int) -> folder.Run:
     return run
 
 
-def _check(chunk: Metrics, done: int, run: folder.Run) -> None:
+def check_finite(chunk: Metrics, done: int, run: folder.Run) -> None:
     """Check that all that was learnt is finite.
 
     Args:

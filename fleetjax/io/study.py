@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from fleetjax.checks import check_run
+from fleetjax.checks import check_plan
 from fleetjax.config import Config, all_fields, make_config
 from fleetjax.envs import list_envs
 from fleetjax.field import every_field, owners
@@ -24,16 +24,24 @@ from fleetjax.io.flags import LARGEST_SEED, LAUNCHERS
 from fleetjax.registry import unknown
 
 Block = Mapping[str, list[Any]]
+Group = tuple[folder.Run, ...]  # completed together by one process
 _MOST_SEEDS = 100_000
 _LEASE = 180  # seconds; NFS shows others' files with up to 60 s delay
 _MINUTES = 24 * 60  # of a job
 _SHORTEST = 15  # minutes; of which the scheduler's warning takes the last ones
-_OF_LAUNCHER: Mapping[str, type] = {"jobs": int, "lease": int, "slurm_partition": str, "slurm_time": int}
+_OF_LAUNCHER: Mapping[str, type] = {
+    "jobs": int,
+    "lease": int,
+    "slurm_gpu": bool,
+    "slurm_partition": str,
+    "slurm_time": int,
+}
 _OPTIONS: Mapping[str, type] = {
     "output": str,
     "workers": int,
     "checkpoint_every": int,
     "log_interventions": bool,
+    "seeds_per_program": int,
     "launcher": str,
     **_OF_LAUNCHER,
 }
@@ -45,10 +53,11 @@ class Launcher(NamedTuple):
 
     Attributes:
         kind: "local": this machine; "slurm": the cluster's scheduler.
-        jobs: number of processes, each with one core.
+        jobs: number of processes, each with one core and, where there are GPUs, one of them.
         lease: seconds without a sign of life after which another job takes over a job's run.
         partition: of the cluster; "" = its default.
         minutes: that a job may take before the scheduler stops and requeues it.
+        gpu: whether to ask the cluster's scheduler for a GPU for each job.
     """
 
     kind: str
@@ -56,6 +65,7 @@ class Launcher(NamedTuple):
     lease: int
     partition: str
     minutes: int
+    gpu: bool
 
 
 class Study(NamedTuple):
@@ -64,10 +74,11 @@ class Study(NamedTuple):
     Attributes:
         blocks: of each part the values by name; the part's runs are their product.
         output: folder for the run folders.
-        workers: processes at once; None = one for each core.
+        workers: processes at once; None = one for each GPU, or else for each core.
         checkpoint_every: timesteps between the checkpoints of a run; 0 = none.
         logged: whether interventions are logged.
         launcher: who starts jobs; None = the sweep has processes of its own.
+        seeds_per_program: runs that differ in nothing but their seed and are computed side by side, see `groups`.
     """
 
     blocks: tuple[Block, ...]
@@ -76,6 +87,7 @@ class Study(NamedTuple):
     checkpoint_every: int
     logged: bool
     launcher: Launcher | None = None
+    seeds_per_program: int = 1
 
 
 def make_study(subjects: Sequence[str], given: Mapping[str, Any]) -> Study:
@@ -100,14 +112,25 @@ def make_study(subjects: Sequence[str], given: Mapping[str, Any]) -> Study:
     expect("output" in options, "--output is missing; name a folder for the runs")
     workers = options.get("workers")
     expect(workers is None or workers >= 1, f"workers = {workers} must be at least 1")
-    defaults = {"algorithm": ["cur"], "seed": [0]}
+    blocks = tuple({"algorithm": ["cur"], "seed": [0], **block} for block in blocks)
+    side_by_side = options.get("seeds_per_program", 1)
+    expect(side_by_side >= 1, f"seeds_per_program = {side_by_side} must be at least 1")
+    for block in blocks:
+        seeds = len(block["seed"])
+        expect(side_by_side <= seeds, f"seeds_per_program = {side_by_side} is more than the number of seeds, {seeds}")
+    if side_by_side > 1 and options.get("checkpoint_every"):
+        raise ValueError(
+            f"checkpoint_every = {options['checkpoint_every']} has no effect with seeds_per_program = {side_by_side}: "
+            "runs side by side write no checkpoints; omit one"
+        )
     return Study(
-        tuple({**defaults, **block} for block in blocks),
+        blocks,
         Path(options["output"]),
         workers,
         options.get("checkpoint_every", 1000),
         options.get("log_interventions", False),
         _launcher(options),
+        side_by_side,
     )
 
 
@@ -124,7 +147,7 @@ def _launcher(options: Mapping[str, Any]) -> Launcher | None:
         return None
     expect(kind in LAUNCHERS, unknown("launcher", kind, LAUNCHERS))
     expect("workers" not in options, "workers are processes of this machine; with a launcher, give jobs instead")
-    for name in ("slurm_partition", "slurm_time"):
+    for name in ("slurm_gpu", "slurm_partition", "slurm_time"):
         expect(kind == "slurm" or name not in options, f"{name} is an option of launcher = 'slurm'; omit it")
     found = Launcher(
         kind,
@@ -132,6 +155,7 @@ def _launcher(options: Mapping[str, Any]) -> Launcher | None:
         lease=options.get("lease", _LEASE),
         partition=options.get("slurm_partition", ""),
         minutes=options.get("slurm_time", _MINUTES),
+        gpu=options.get("slurm_gpu", False),
     )
     expect(found.jobs >= 1, f"jobs = {found.jobs} must be at least 1")
     expect(found.lease >= 1, f"lease = {found.lease} must be at least 1 second")
@@ -235,15 +259,26 @@ def plan(study: Study) -> list[folder.Run]:
     for same in (identities, [str(run.folder) for run in runs]):
         twice = collections.Counter(same).most_common(1)[0]
         expect(twice[1] == 1, f"{runs[same.index(twice[0])].folder.name} is in the sweep twice; omit one")
-    for run in {program(run): run for run in reversed(runs)}.values():
+    for run in {program((run,)): run for run in reversed(runs)}.values():
         with _naming(run.folder.name):
-            check_run(run.config)
+            check_plan(run.config)
     return runs
 
 
-def program(run: folder.Run) -> Any:
-    """Return what is equal for runs that share a compiled program: all that is static in their configurations."""
-    return jax.tree.structure(run.config)
+def groups(runs: Sequence[folder.Run], size: int) -> list[Group]:
+    """Return the runs of a sweep in groups of at most `size`, of runs that differ in nothing but their seed.
+
+    A group depends on the sweep alone, not on what is finished: with other runs beside it, a run rounds differently.
+    """
+    alike: dict[str, list[folder.Run]] = {}
+    for run in runs:
+        alike.setdefault(repr(plain.to_plain(run.config)), []).append(run)
+    return [tuple(same[i : i + size]) for same in alike.values() for i in range(0, len(same), size)]
+
+
+def program(group: Group) -> Any:
+    """Return what is equal for groups that share a compiled program: their size, and what is static in their configuration."""
+    return len(group), jax.tree.structure(group[0].config)
 
 
 def _check_used(blocks: Sequence[Block]) -> None:

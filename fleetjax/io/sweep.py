@@ -11,13 +11,20 @@ import os
 import time
 from collections.abc import Sequence
 
+import jax
+
 from fleetjax.io import cluster, crew, files, folder, metrics_csv, resumable, text
 from fleetjax.io.errors import Incomplete
 from fleetjax.io.job import LOGS
 from fleetjax.io.progress import progress_of_many, say
-from fleetjax.io.study import Study, plan
+from fleetjax.io.study import Group, Study, groups, plan
 
 FILE = "sweep.json"
+
+
+def leave_gpus_to_workers() -> None:
+    """Let this process compute on the CPU: JAX would hold the GPUs, which its workers need."""
+    jax.config.update("jax_platforms", "cpu")
 
 
 def check_folder(study: Study, runs: Sequence[folder.Run]) -> None:
@@ -31,8 +38,14 @@ def check_folder(study: Study, runs: Sequence[folder.Run]) -> None:
         free = not os.path.lexists(path) or (path.is_dir() and {found.name for found in path.iterdir()} <= {files.LOCK})
         files.expect(free, f"{path} already exists and is not the folder of a sweep; choose another --output")
         return
+    held = _read(study)
+    files.expect(
+        held.seeds_per_program == study.seeds_per_program,
+        f"seeds_per_program = {study.seeds_per_program}, but the sweep in {path} has {held.seeds_per_program}, and its runs "
+        "would round differently; choose another --output",
+    )
     here = {run.folder: run for run in runs}
-    for run in _read(study):
+    for run in plan(held):
         files.expect(
             run.folder in here,
             f"{path} holds another sweep, with a run {run.folder.name} that this one lacks; choose another --output",
@@ -41,8 +54,8 @@ def check_folder(study: Study, runs: Sequence[folder.Run]) -> None:
         files.expect(not difference, f"{run.folder.name}: {difference} in {path}; choose another --output")
 
 
-def _read(study: Study) -> list[folder.Run]:
-    """Return the runs of the sweep that the folder holds.
+def _read(study: Study) -> Study:
+    """Return the sweep that the folder holds.
 
     Raises:
         ValueError: if what says so is damaged.
@@ -50,7 +63,13 @@ def _read(study: Study) -> list[folder.Run]:
     path = study.output / FILE
     try:
         content = json.loads(path.read_bytes())
-        return plan(study._replace(blocks=tuple(content["runs"]), logged=content["log_interventions"]))
+        found = study._replace(
+            blocks=tuple(content["runs"]),
+            logged=content["log_interventions"],
+            seeds_per_program=content.get("seeds_per_program", 1),
+        )
+        plan(found)
+        return found
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise ValueError(f"{path} cannot be used: {files.one_line(error)}; choose another --output") from None
 
@@ -65,10 +84,12 @@ def run_all(study: Study, runs: Sequence[folder.Run]) -> None:
     begun = time.monotonic()
     study.output.mkdir(parents=True, exist_ok=True)
     with files.lock(study.output):
-        files.write_json(study.output / FILE, {"runs": study.blocks, "log_interventions": study.logged})
+        content = {"runs": study.blocks, "log_interventions": study.logged, "seeds_per_program": study.seeds_per_program}
+        files.write_json(study.output / FILE, content)
         (study.output / LOGS).mkdir(exist_ok=True)
-        waiting = [run for run in runs if not is_finished(run)]
-        finished, all_runs = len(runs) - len(waiting), text.plural(len(runs), "run")
+        done = {run.folder for run in runs if is_finished(run)}
+        waiting = [group for group in groups(runs, study.seeds_per_program) if not done.issuperset(run.folder for run in group)]
+        finished, all_runs = len(done), text.plural(len(runs), "run")
         say(f"{all_runs}, {finished} of them finished already")
         try:
             failed = _complete(study, runs, waiting)
@@ -89,15 +110,15 @@ def is_finished(run: folder.Run) -> bool:
         return False
 
 
-def _workers(study: Study, waiting: Sequence[folder.Run]) -> crew.Crew | cluster.Jobs:
+def _workers(study: Study, waiting: Sequence[Group]) -> crew.Crew | cluster.Jobs:
     """Return who completes the runs that wait."""
     if study.launcher and waiting:
         return cluster.Jobs(study, waiting)
     return crew.Crew(waiting, study.workers, study.checkpoint_every, study.output / LOGS)
 
 
-def _complete(study: Study, runs: Sequence[folder.Run], waiting: Sequence[folder.Run]) -> int:
-    """Complete the runs that wait, and show how all of them stand.
+def _complete(study: Study, runs: Sequence[folder.Run], waiting: Sequence[Group]) -> int:
+    """Complete the groups that wait, and show how all runs stand.
 
     Returns:
         int: how many failed.
@@ -105,9 +126,9 @@ def _complete(study: Study, runs: Sequence[folder.Run], waiting: Sequence[folder
     Raises:
         KeyboardInterrupt: if it was asked to stop before all had ended.
     """
-    logs = study.output / LOGS
+    logs = {run.folder: study.output / LOGS / f"{group[0].folder.name}.log" for group in waiting for run in group}
     timesteps = {run.folder: metrics_csv.count(run.folder) for run in runs}
-    ended, failed = len(runs) - len(waiting), 0
+    ended, failed = len(runs) - len(logs), 0
     with (
         progress_of_many(len(runs), sum(run.config.num_steps for run in runs), sum(timesteps.values())) as show,
         resumable.stoppable() as asked_to_stop,
@@ -116,7 +137,7 @@ def _complete(study: Study, runs: Sequence[folder.Run], waiting: Sequence[folder
         while workers.busy:
             for run, reason in workers.wait():
                 ended, failed, timesteps[run.folder] = ended + 1, failed + bool(reason), run.config.num_steps
-                news = f"failed: {reason}; its log is {logs / run.folder.name}.log" if reason else "finished"
+                news = f"failed: {reason}; its log is {logs[run.folder]}" if reason else "finished"
                 show(ended, sum(timesteps.values()), f"{run.folder.name} {news}", failed=bool(reason))
             timesteps |= {run.folder: metrics_csv.count(run.folder) for run in workers.busy}
             show(ended, sum(timesteps.values()))

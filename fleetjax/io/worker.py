@@ -1,6 +1,6 @@
-"""A worker of a sweep: a process with cores of its own, which takes runs from its parent and completes one after the other.
+"""A worker of a sweep: a process which takes groups of runs from its parent and completes one after the other.
 
-Nothing here loads JAX before the worker has its cores, since JAX starts a thread for each of them.
+Nothing here loads JAX before the worker has taken its place.
 """
 
 import multiprocessing
@@ -12,35 +12,35 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 from fleetjax.io import files
+from fleetjax.io.place import Place
 
 
-def work(parent: Connection, cores: list[int], checkpoint_every: int, logs: Path) -> None:
-    """Receive runs, as `folder.Run`, until the parent closes its end; send after each "", or why it failed.
+def work(parent: Connection, place: Place, checkpoint_every: int, logs: Path) -> None:
+    """Receive groups, as `study.Group`, until the parent closes its end; send for each run of a group "", or why it failed.
 
-    What a run says goes to a log of its own.
+    What a group says goes to a log of its own, named after its first run.
 
     Args:
-        parent: where runs come from.
-        cores: that this process may use.
+        parent: where groups come from.
+        place: that this process may use.
         checkpoint_every: timesteps between checkpoints; 0 = none.
         logs: folder of the logs.
     """
-    os.sched_setaffinity(0, cores)
+    place.take()
     threading.Thread(target=_end_with_parent, daemon=True).start()
     while True:
         try:
-            run = parent.recv()
+            runs = parent.recv()
         except EOFError:
             return
-        log_to(logs / f"{run.folder.name}.log")
-        from fleetjax.io import resumable
+        log_to(logs / f"{runs[0].folder.name}.log")
+        from fleetjax.io import group
 
         try:
-            resumable.complete(run, checkpoint_every=checkpoint_every)
-            parent.send("")
+            parent.send(group.complete(runs, checkpoint_every=checkpoint_every))
         except Exception as error:
             traceback.print_exc()
-            parent.send(files.one_line(error))
+            parent.send([files.one_line(error)] * len(runs))
         except KeyboardInterrupt as interrupt:  # the parent asked for it, and needs no answer
             sys.exit(f"interrupted {' '.join(interrupt.args)}")
 

@@ -1,5 +1,6 @@
 """A robot's physics: a MuJoCo model, bound to a backend."""
 
+import importlib.util
 from pathlib import Path
 
 import jax
@@ -8,9 +9,9 @@ import mujoco
 from fleetjax.physics import native
 from fleetjax.physics.contract import Physics, PhysicsState, initial_state
 
-__all__ = ["BACKENDS", "MODELS", "Physics", "PhysicsState", "make_physics", "resolve_backend"]
+__all__ = ["BACKENDS", "MODELS", "Physics", "PhysicsState", "check_backend", "make_physics", "resolve_backend"]
 
-BACKENDS = ("auto", "native", "mjx")
+BACKENDS = ("auto", "native", "mjx", "warp")
 MODELS = Path(__file__).parent / "models"
 
 
@@ -27,13 +28,30 @@ def resolve_backend(backend: str) -> str:
     return "native" if jax.default_backend() == "cpu" else "mjx"
 
 
+def check_backend(backend: str) -> None:
+    """Check that this process can simulate robots by a backend.
+
+    Raises:
+        ValueError: if `backend` is unknown, or it is warp and there is no NVIDIA GPU, or warp is not installed.
+    """
+    if resolve_backend(backend) != "warp":
+        return
+    missing = [] if jax.default_backend() == "gpu" else ["JAX finds no GPU here"]
+    missing += [] if importlib.util.find_spec("warp") else ["warp-lang is not installed"]
+    if missing:
+        raise ValueError(
+            f"backend = 'warp' needs an NVIDIA GPU and pip install \"fleetjax[cuda12,warp]\" ({' and '.join(missing)}); "
+            "or choose backend = 'mjx'"
+        )
+
+
 def make_physics(model_file: str, *, substeps: int, backend: str = "auto") -> Physics:
     """Load a MuJoCo model and bind it to a backend.
 
     Args:
         model_file: file name below `fleetjax/physics/models`, or the absolute path of a model of your own.
         substeps: simulation steps in one control step.
-        backend: `"native"` (MuJoCo C on CPU threads), `"mjx"` (pure JAX) or `"auto"`.
+        backend: `"native"` (MuJoCo C on CPU threads), `"mjx"` (pure JAX), `"warp"` (NVIDIA GPUs) or `"auto"`.
 
     Raises:
         ValueError: if `backend` is unknown.
@@ -43,7 +61,6 @@ def make_physics(model_file: str, *, substeps: int, backend: str = "auto") -> Ph
     if backend == "native":
         step = native.make_step(model, substeps)
     else:
-        from fleetjax.physics import mjx  # imported on demand: it takes seconds
-
-        step = mjx.make_step(model, substeps)
+        module = importlib.import_module(f"fleetjax.physics.{backend}")  # on demand: it takes seconds
+        step = module.make_step(model, substeps)
     return Physics(initial_state(model), step, model, substeps * float(model.opt.timestep))

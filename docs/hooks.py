@@ -9,7 +9,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 from fleetjax.config import FIELDS, Config
-from fleetjax.io.flags import show
+from fleetjax.io.parameters import show
 
 _TABLE = "<!-- table of configuration fields -->"
 _RESULTS = Path(__file__).parents[1] / "experiments" / "results"

@@ -22,10 +22,10 @@ from fleetjax.io import (
     cluster,
     export,
     files,
-    flags,
     folder,
     formats,
     outcomes,
+    parameters,
     resumable,
     sources,
     study,
@@ -203,13 +203,13 @@ def list_all(arguments: argparse.Namespace) -> None:
     print(text.table(rows, right=[2, 3, 4, 5]))
     for name in list_envs():
         changed = {field: value for field, value in get_defaults(name).items() if value != every_field()[field].default}
-        print(f"  {name}'s own defaults: {', '.join(f'{field} {flags.show(value)}' for field, value in changed.items())}")
+        print(f"  {name}'s own defaults: {', '.join(f'{field} {parameters.show(value)}' for field, value in changed.items())}")
     print("\nalgorithms")
     named = [name for name in list_algorithms() if not text.is_order(name) or name == "cur"]
     print(text.table([("", name, text.label(name), text.meaning(name)) for name in named]))
     for name, field in every_field().items():
         if name not in FIELDS:
-            print(f"  own parameter of {owners_in_words(name)}: {name} {flags.show(field.default)}, {field.help}")
+            print(f"  own parameter of {owners_in_words(name)}: {name} {parameters.show(field.default)}, {field.help}")
     print(f"  and {text.ORDERS}")
 
 

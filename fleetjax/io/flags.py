@@ -1,25 +1,21 @@
-"""What can be typed: commands and flags, a flag for each parameter. Nothing here loads JAX, so that help comes at once."""
+"""What can be typed: commands and their flags. Nothing here loads JAX, so that help comes at once."""
 
 import argparse
 import difflib
 import functools
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NoReturn
 
-from fleetjax.environments import get_defaults, list_envs
-from fleetjax.field import FIELDS, OF_LINKS, Field, every_field, owners_in_words
+from fleetjax.environments import list_envs
 from fleetjax.io.errors import Refusal
 from fleetjax.io.formats import FORMATS
-from fleetjax.io.lists import listed, sizes
+from fleetjax.io.lists import listed
+from fleetjax.io.parameters import add_parameters, integer, number, seed
 from fleetjax.registry import unknown
 from fleetjax.version import VERSION
 
 LAUNCHERS = ("local", "slurm")
-LARGEST_SEED = 2**32 - 1  # JAX folds larger ones onto these
-_LARGEST = 2**31 - 1
 _RUNS = "run folder, folder that holds run folders, or file that `fleetjax compare --rows` wrote"
 PORT = 8765  # that a console serves
 _ABOUT = """\
@@ -131,8 +127,8 @@ def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser
     _add_compare(commands)
     evaluate = commands.add_parser("evaluate", help="run a trained policy without teleoperation", description=_EVALUATE_ABOUT)
     evaluate.add_argument("run", metavar="RUN", type=Path, help="run folder")
-    evaluate.add_argument("--num-steps", metavar="N", type=_integer, default=10_000, help="timesteps [default: 10000]")
-    evaluate.add_argument("--seed", metavar="N", type=_seed, help="random seed [default: the run's, plus 1]")
+    evaluate.add_argument("--num-steps", metavar="N", type=integer, default=10_000, help="timesteps [default: 10000]")
+    evaluate.add_argument("--seed", metavar="N", type=seed, help="random seed [default: the run's, plus 1]")
     evaluate.add_argument("--overwrite", action="store_true", help="replace an older evaluation.json in the run folder")
 
     export = commands.add_parser("export", help="write a run's interventions as a data set", description=_EXPORT_ABOUT)
@@ -150,14 +146,14 @@ def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser
     render.add_argument("source", metavar="RUN|ENV", help="run folder, or environment")
     policies = ("expert", "robot", "mixed")
     render.add_argument("--policy", choices=policies, help="who acts [default: robot for a run, expert for an environment]")
-    render.add_argument("--num-shown", metavar="N", type=_integer, default=4, help="robots in the picture [default: 4]")
-    render.add_argument("--num-steps", metavar="N", type=_integer, default=200, help="timesteps to draw [default: 200]")
-    render.add_argument("--skip", metavar="N", type=_integer, default=0, help="timesteps to run before them [default: 0]")
-    render.add_argument("--every", metavar="N", type=_integer, default=2, help="timesteps per picture [default: 2]")
+    render.add_argument("--num-shown", metavar="N", type=integer, default=4, help="robots in the picture [default: 4]")
+    render.add_argument("--num-steps", metavar="N", type=integer, default=200, help="timesteps to draw [default: 200]")
+    render.add_argument("--skip", metavar="N", type=integer, default=0, help="timesteps to run before them [default: 0]")
+    render.add_argument("--every", metavar="N", type=integer, default=2, help="timesteps per picture [default: 2]")
     render.add_argument(
-        "--width", metavar="N", type=_integer, default=320, help="width of a robot's tile (pixels) [default: 320]"
+        "--width", metavar="N", type=integer, default=320, help="width of a robot's tile (pixels) [default: 320]"
     )
-    render.add_argument("--seed", metavar="N", type=_seed, help="random seed [default: the run's, or 0]")
+    render.add_argument("--seed", metavar="N", type=seed, help="random seed [default: the run's, or 0]")
     render.add_argument(
         "--output", metavar="FILE", type=Path, default=Path("fleetjax.gif"), help="gif or mp4 [default: fleetjax.gif]"
     )
@@ -213,13 +209,13 @@ def _add_run(commands: Any, environment: str | None) -> None:
     environments = f"environment: {', '.join(list_envs())}"
     run.add_argument("environment", metavar="ENV", nargs="?", default=argparse.SUPPRESS, help=environments)
     run.add_argument("--resume", metavar="RUN", type=Path, help="resume a stopped run from its newest intact checkpoint")
-    run.add_argument("--seed", metavar="N", type=_seed, help="random seed [default: 0]")
+    run.add_argument("--seed", metavar="N", type=seed, help="random seed [default: 0]")
     run.add_argument("--output", metavar="DIR", type=Path, help="run folder [default: a new one below runs/]")
     run.add_argument("--overwrite", action="store_true", help="replace the run in an existing folder")
     run.add_argument(
         "--checkpoint-every",
         metavar="N",
-        type=_integer,
+        type=integer,
         default=1000,
         help="timesteps between checkpoints, of which the last two are kept; 0 = none [default: 1000]",
     )
@@ -227,7 +223,7 @@ def _add_run(commands: Any, environment: str | None) -> None:
         "--log-interventions", action="store_true", help="log what teleoperating humans see and do, for `fleetjax export`"
     )
     _add_distribution(run)
-    _add_parameters(run, environment)
+    add_parameters(run, environment)
 
 
 def _add_distribution(run: Any) -> None:
@@ -236,13 +232,13 @@ def _add_distribution(run: Any) -> None:
     group.add_argument("--distributed", action="store_true", help=every)
     place = "where process 0 listens; not needed under SLURM, nor with --num-processes 1"
     group.add_argument("--coordinator", metavar="HOST:PORT", help=place)
-    group.add_argument("--num-processes", metavar="P", type=_integer, help="number of processes")
-    group.add_argument("--process-id", metavar="I", type=_integer, help="which of them this is, from 0 to P - 1")
+    group.add_argument("--num-processes", metavar="P", type=integer, help="number of processes")
+    group.add_argument("--process-id", metavar="I", type=integer, help="which of them this is, from 0 to P - 1")
     wait = "seconds to wait for the other processes at the start [default: 60]"
-    group.add_argument("--connect-timeout", metavar="S", type=_integer, default=60, help=wait)
+    group.add_argument("--connect-timeout", metavar="S", type=integer, default=60, help=wait)
     hang = "end if nothing is finished for S seconds: no compilation, checkpoint or chunk of timesteps, about a hundredth of "
     hang += "the run; choose more than the longest of these takes [default: 1800]"
-    group.add_argument("--step-timeout", metavar="S", type=_integer, default=1800, help=hang)
+    group.add_argument("--step-timeout", metavar="S", type=integer, default=1800, help=hang)
 
 
 def _add_sweep(commands: Any, environment: str | None) -> None:
@@ -254,28 +250,28 @@ def _add_sweep(commands: Any, environment: str | None) -> None:
     environments = f"environments: {', '.join(list_envs())}; or a .toml file that says what to run"
     sweep.add_argument("subjects", metavar="ENV|FILE", nargs="*", type=listed(str), help=environments)
     options: dict[str, Any] = {"default": argparse.SUPPRESS}
-    sweep.add_argument("--seeds", metavar="N", type=_integer, help="as many seeds: 0 to N - 1 [default: 1]", **options)
-    sweep.add_argument("--seed", metavar="N,...", type=listed(_seed), help="these seeds", **options)
+    sweep.add_argument("--seeds", metavar="N", type=integer, help="as many seeds: 0 to N - 1 [default: 1]", **options)
+    sweep.add_argument("--seed", metavar="N,...", type=listed(seed), help="these seeds", **options)
     sweep.add_argument("--output", metavar="DIR", type=Path, help="folder for the run folders", **options)
     workers = "processes, which share the cores [default: one for each GPU; without GPUs, one for each core]"
-    sweep.add_argument("--workers", metavar="W", type=_integer, help=workers, **options)
+    sweep.add_argument("--workers", metavar="W", type=integer, help=workers, **options)
     together = "compute K seeds side by side in one program, without checkpoints; they round differently [default: 1]"
-    sweep.add_argument("--seeds-per-program", metavar="K", type=_integer, help=together, **options)
+    sweep.add_argument("--seeds-per-program", metavar="K", type=integer, help=together, **options)
     launcher = "complete the sweep by one-core jobs: local = on this machine, slurm = on a cluster; replaces --workers"
     sweep.add_argument("--launcher", choices=LAUNCHERS, help=launcher, **options)
-    sweep.add_argument("--jobs", metavar="J", type=_integer, help="number of jobs [default: 1]", **options)
+    sweep.add_argument("--jobs", metavar="J", type=integer, help="number of jobs [default: 1]", **options)
     gpu = "ask for one GPU for each job"
     sweep.add_argument("--slurm-gpu", action="store_true", help=gpu, **options)
     sweep.add_argument("--slurm-partition", metavar="P", help="SLURM partition [default: the cluster's]", **options)
     term = "take over the run of a job that has shown no sign of life for S seconds [default: 180]"
-    sweep.add_argument("--lease", metavar="S", type=_integer, help=term, **options)
+    sweep.add_argument("--lease", metavar="S", type=integer, help=term, **options)
     minutes = "minutes of a job; it is requeued shortly before they are over [default: 1440]"
-    sweep.add_argument("--slurm-time", metavar="MIN", type=_integer, help=minutes, **options)
+    sweep.add_argument("--slurm-time", metavar="MIN", type=integer, help=minutes, **options)
     every = "timesteps between the checkpoints of a run; 0 = none [default: 1000]"
-    sweep.add_argument("--checkpoint-every", metavar="N", type=_integer, help=every, **options)
+    sweep.add_argument("--checkpoint-every", metavar="N", type=integer, help=every, **options)
     logged = "log what teleoperating humans see and do, for `fleetjax export`"
     sweep.add_argument("--log-interventions", action="store_true", help=logged, **options)
-    _add_parameters(sweep, environment, with_lists=True)
+    add_parameters(sweep, environment, with_lists=True)
 
 
 def _add_calibrate(commands: Any, environment: str | None) -> None:
@@ -285,17 +281,17 @@ def _add_calibrate(commands: Any, environment: str | None) -> None:
     )
     calibrate.add_argument("environment", metavar="ENV", nargs="?", default=argparse.SUPPRESS, help="environment")
     wanted = "human timesteps that a run should spend, hard resets included"
-    calibrate.add_argument("--human-time", metavar="X", type=_number, help=wanted)
+    calibrate.add_argument("--human-time", metavar="X", type=number, help=wanted)
     calibrate.add_argument("--field", metavar="NAME", help="parameter to find [default: the algorithm's threshold]")
-    calibrate.add_argument("--first-seed", metavar="N", type=_seed, default=0, help="seed of the search [default: 0]")
-    calibrate.add_argument("--seeds", metavar="N", type=_integer, default=3, help="seeds in all [default: 3]")
+    calibrate.add_argument("--first-seed", metavar="N", type=seed, default=0, help="seed of the search [default: 0]")
+    calibrate.add_argument("--seeds", metavar="N", type=integer, default=3, help="seeds in all [default: 3]")
     near = "relative difference that is near enough [default: 0.05]"
-    calibrate.add_argument("--tolerance", metavar="X", type=_number, default=0.05, help=near)
-    calibrate.add_argument("--most", metavar="N", type=_integer, default=10, help="runs of the search at most [default: 10]")
+    calibrate.add_argument("--tolerance", metavar="X", type=number, default=0.05, help=near)
+    calibrate.add_argument("--most", metavar="N", type=integer, default=10, help="runs of the search at most [default: 10]")
     calibrate.add_argument("--output", metavar="DIR", type=Path, help="folder of its runs [default: below runs/]")
     every = "timesteps between the checkpoints of a run; 0 = none [default: 1000]"
-    calibrate.add_argument("--checkpoint-every", metavar="N", type=_integer, default=1000, help=every)
-    _add_parameters(calibrate, environment)
+    calibrate.add_argument("--checkpoint-every", metavar="N", type=integer, default=1000, help=every)
+    add_parameters(calibrate, environment)
 
 
 def _add_console(commands: Any, environment: str | None) -> None:
@@ -305,149 +301,24 @@ def _add_console(commands: Any, environment: str | None) -> None:
     )
     console.add_argument("environment", metavar="ENV", nargs="?", default=argparse.SUPPRESS, help="environment with pictures")
     console.add_argument("--host", default="127.0.0.1", help="address to listen on; any but this machine's own needs --token")
-    console.add_argument("--port", metavar="N", type=_integer, default=PORT, help=f"port; 0 = any free one [default: {PORT}]")
+    console.add_argument("--port", metavar="N", type=integer, default=PORT, help=f"port; 0 = any free one [default: {PORT}]")
     console.add_argument("--token", help="token that pages need as ?token=TOKEN: 8 to 128 letters, digits, or . _ ~ -")
-    console.add_argument("--interval", metavar="X", type=_number, help="seconds per timestep [default: the control step]")
+    console.add_argument("--interval", metavar="X", type=number, help="seconds per timestep [default: the control step]")
     console.add_argument(
         "--timeout",
         metavar="X",
-        type=_number,
+        type=number,
         default=10.0,
         help="seconds until a lost connection frees its seat [default: 10]",
     )
     console.add_argument(
-        "--wait", metavar="N", type=_integer, default=1, help="people to wait for before the first timestep [default: 1]"
+        "--wait", metavar="N", type=integer, default=1, help="people to wait for before the first timestep [default: 1]"
     )
     fills = ("simulated", "empty")
     console.add_argument(
         "--fill", choices=fills, default="simulated", help="who plays the seats that nobody takes [default: simulated]"
     )
-    console.add_argument("--seed", metavar="N", type=_seed, help="random seed [default: 0]")
+    console.add_argument("--seed", metavar="N", type=seed, help="random seed [default: 0]")
     console.add_argument("--output", metavar="DIR", type=Path, help="run folder [default: a new one below runs/]")
     console.add_argument("--overwrite", action="store_true", help="replace the run in an existing folder")
-    _add_parameters(console, environment, short={"num_humans": "--humans"})
-
-
-def _add_parameters(
-    command: Any,
-    environment: str | None,
-    short: Mapping[str, str] = MappingProxyType({}),
-    *,
-    with_lists: bool = False,
-) -> None:
-    """Add a flag for each field of `Config`, with a short form for some, and for each parameter of an algorithm."""
-    add = _add_list if with_lists else _add_field
-    fields = command.add_argument_group(f"parameters{f' (defaults of {environment})' if environment else ''}")
-    people = command.add_argument_group("humans and links (@FILE: a number for each human)")
-    own = command.add_argument_group("parameters of one algorithm each")
-    for name, field in every_field().items():
-        if name in FIELDS and name != "environment":
-            add(
-                people if field.per_human or name in OF_LINKS else fields,
-                name,
-                field,
-                environment,
-                *([short[name]] if name in short else []),
-            )
-        elif name not in FIELDS:
-            add(own, name, field._replace(help=f"{owners_in_words(name)}: {field.help}"), environment)
-
-
-def _add_field(group: Any, name: str, field: Field, environment: str | None, *short: str) -> None:
-    options: dict[str, Any] = {"default": argparse.SUPPRESS, "help": _help(name, field, environment)}
-    if field.kind is bool:
-        options |= {"action": argparse.BooleanOptionalAction}
-    elif field.kind is tuple:
-        options |= {"type": _integer, "nargs": "+", "metavar": "N"}
-    else:
-        options["type"], options["metavar"] = _reader(field)
-    group.add_argument(_flag(name), *short, **options)
-
-
-def _add_list(group: Any, name: str, field: Field, environment: str | None) -> None:
-    """Add a flag that takes several values of a parameter, separated by commas, in place of one."""
-    options: dict[str, Any] = {"default": argparse.SUPPRESS, "help": _help(name, field, environment)}
-    if field.kind is tuple:
-        options |= {"action": sizes(_integer), "nargs": "+", "metavar": "N"}
-    else:
-        read, letter = _reader(field)
-        options |= {"type": listed(read), "metavar": f"{letter},..."}
-    if field.kind is bool:
-        options |= {"nargs": "?", "const": [True]}
-        group.add_argument(f"--no-{_flag(name)[2:]}", dest=name, action="store_const", const=[False], default=argparse.SUPPRESS)
-    group.add_argument(_flag(name), **options)
-
-
-def _flag(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
-
-
-def _help(name: str, field: Field, environment: str | None) -> str:
-    unit = f" ({field.unit})" if field.unit else ""
-    return f"{field.help}{unit} [default: {_default(name, field, environment)}]".replace("%", "%%")
-
-
-def _default(name: str, field: Field, environment: str | None) -> str:
-    general = field.default
-    if environment:
-        return show(get_defaults(environment).get(name, general))
-    changed = {env: get_defaults(env)[name] for env in list_envs() if get_defaults(env).get(name, general) != general}
-    return "; ".join([show(general), *(f"{env} {show(value)}" for env, value in changed.items())])
-
-
-def show(value: Any) -> str:
-    """Return a value as it is typed on the command line."""
-    if isinstance(value, bool):
-        return "on" if value else "off"
-    if isinstance(value, tuple):
-        return " ".join(map(str, value))
-    return f"{value:g}" if isinstance(value, float) else str(value) or "the environment's own"
-
-
-def _integer(text: str) -> int:
-    value = _number(text)
-    if not math.isfinite(value) or value != int(value) or abs(value) > _LARGEST:
-        raise argparse.ArgumentTypeError(f"{text} must be a whole number, at most {_LARGEST}")
-    return int(value)
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} must be a number") from None
-
-
-def _number_or_file(text: str) -> float | tuple[float, ...]:
-    """Return a number, or of @FILE the numbers that it holds, one for each human, separated by white space."""
-    if not text.startswith("@"):
-        return _number(text)
-    try:
-        return tuple(map(_number, Path(text[1:]).read_text().split()))
-    except (OSError, UnicodeDecodeError) as error:
-        raise argparse.ArgumentTypeError(f"{text[1:]} cannot be read: {error}") from None
-
-
-def _switch(text: str) -> bool:
-    if text not in ("on", "off"):
-        raise argparse.ArgumentTypeError(f"{text!r} must be on or off")
-    return text == "on"
-
-
-def _seed(text: str) -> int:
-    if not text.isascii() or not text.isdecimal() or int(text) > LARGEST_SEED:
-        raise argparse.ArgumentTypeError(f"{text!r} must be a whole number from 0 to {LARGEST_SEED}")
-    return int(text)
-
-
-def _reader(field: Field) -> tuple[Any, str]:
-    """Return what reads a field's value, and what stands for it in the help."""
-    return (_number_or_file, "X|@FILE") if field.per_human else _KINDS[field.kind]
-
-
-_KINDS = {  # what reads a value, and what stands for it in the help
-    str: (str, "NAME"),
-    int: (_integer, "N"),
-    float: (_number, "X"),
-    bool: (_switch, "on|off"),
-}
+    add_parameters(console, environment, short={"num_humans": "--humans"})

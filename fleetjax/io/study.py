@@ -20,7 +20,8 @@ from fleetjax.envs import list_envs
 from fleetjax.field import every_field, owners
 from fleetjax.io import folder, plain
 from fleetjax.io.files import expect
-from fleetjax.io.flags import LARGEST_SEED, LAUNCHERS
+from fleetjax.io.flags import LAUNCHERS
+from fleetjax.io.parameters import LARGEST_SEED
 from fleetjax.registry import unknown
 
 Block = Mapping[str, list[Any]]

@@ -33,8 +33,8 @@ def with_parts(state: FleetState, parts: int) -> FleetState:
 
 def place(state: FleetState) -> FleetState:
     """Return a state that is divided over the mesh."""
-    robots = (state.env, state.resetting, state.correction)
-    env, resetting, correction = sharding.pin(robots, sharding.DIVIDED)
+    robots = (state.env, state.resetting, state.given, state.correction)
+    env, resetting, given, correction = sharding.pin(robots, sharding.DIVIDED)
 
     def put(x: Any) -> Any:
         if not isinstance(x, Buffer) or not x.added.ndim:
@@ -53,6 +53,7 @@ def place(state: FleetState) -> FleetState:
         env=env,
         humans=humans,
         resetting=resetting,
+        given=given,
         correction=correction,
         policy=policy,
         human_data=human_data,

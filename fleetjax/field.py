@@ -214,7 +214,11 @@ PARAMETERS: dict[str, Mapping[str, Field]] = {
         "whittle_threshold": Field("index, as worth of a timestep of help, at or below which no robot is helped", default=0.1),
         "whittle_discount": Field("what the next timestep counts", high=0.9999, default=0.99),
     },
-    "asa": {"asa_threshold": Field("gain in coverage below which nobody else is helped", default=0.351)},
+    "asa": {
+        "asa_threshold": Field("gain in coverage below which nobody else is helped", default=0.351),
+        "asa_uncertainty": Field("robots below this uncertainty count as certain", default=0.151),
+        "asa_risk": Field("robots below this risk count as safe", high=1, default=0.198),
+    },
     **{letters: {"idle_humans_teleoperate": _IDLE} for letters in ORDERS_WITH_C},
 }
 

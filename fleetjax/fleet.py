@@ -49,6 +49,7 @@ class FleetState(NamedTuple):
         env: EnvState[N].
         humans: HumanState[M] at the end of the last timestep.
         resetting: bool[N] whether a human was resetting the robot at the last timestep.
+        given: bool[N] whether a human's action was done at the last timestep.
         correction: f32[N] see `Signals`.
         policy: what the robots have learnt.
         human_data: what they learn from.
@@ -57,13 +58,14 @@ class FleetState(NamedTuple):
         origin: what it was prepared for.
         weight: f32[N] how much of a human each robot had at the last timestep, in the soft allocation; None in the hard one.
         people: what the human model carries; nothing for perfect humans.
-        links: PerRobot of bool[N], which links worked at the last timestep; nothing if all always do.
+        links: PerRobot of `humans.Lines`, the robots' connections; nothing if all always work.
     """
 
     timestep: jax.Array
     env: EnvState
     humans: HumanState
     resetting: jax.Array
+    given: jax.Array
     correction: jax.Array
     policy: PolicyState
     human_data: HumanData
@@ -156,6 +158,7 @@ def init(parts: Parts, key: jax.Array, policy: PolicyState, data: HumanData, est
         env=reset_robots(parts, jax.random.split(key, n)),
         humans=HumanState(jnp.full(m, -1, jnp.int32), jnp.zeros(m, jnp.int32)),
         resetting=jnp.zeros(n, bool),
+        given=jnp.zeros(n, bool),
         correction=jnp.zeros(n, jnp.float32),
         policy=policy,
         human_data=data,
@@ -179,7 +182,7 @@ def logged_step(parts: Parts, state: FleetState, key: jax.Array) -> tuple[FleetS
         people, human_action, given = parts.people.act(people, planned, human_action, key_of_people(key))
     if parts.links:
         works = humans.draw(planned.signals.link, key_of_links(key))
-        given, links = given & works, priority.PerRobot(works)
+        given, links = given & works, priority.PerRobot(links.values._replace(works=works))
     after, counts, stepped = act(parts, state, planned, human_action, given, keys)
     after = after._replace(people=people, links=links)
     return after, (counts, watch(state.env, planned._replace(teleoperated=given), human_action, stepped))
@@ -190,7 +193,7 @@ def plan(parts: Parts, state: FleetState, keys: Keys, available: jax.Array | Non
     config = parts.config
     signals = observe(parts, state, keys)
     score, memory = parts.rule.score(signals, state.priority, keys.score)
-    min_time = jnp.where(state.resetting, config.hard_reset_time, config.min_teleop_time)
+    min_time = jnp.where(state.resetting, config.hard_reset_time, config.min_teleop_time + unready(parts, state))
     binding = score if state.weight is None else parts.binding.score(signals, state.priority, keys.score)[0]
     humans = parts.allocate(binding, state.humans, min_time, keys.ties, available, signals)
     helped = helper_of(humans, config.num_robots) >= 0
@@ -223,6 +226,7 @@ def act(
         env=renewed,
         humans=humans,
         resetting=planned.resetting,
+        given=given & sound,
         correction=correction,
         weight=planned.weight,
     )
@@ -232,6 +236,14 @@ def act(
     if planned.weight is not None:
         counts = soft.relax(parts.config, parts.env, counts, planned.weight, stepped, moving)
     return state, counts, stepped
+
+
+def unready(parts: Parts, state: FleetState) -> jax.Array | int:
+    """Return i32[N], for how many timesteps of the help that each robot has its human was not ready to act."""
+    if not parts.people or not parts.people.unready:
+        return 0
+    helper = helper_of(state.humans, parts.config.num_robots)
+    return jnp.where(helper >= 0, parts.people.unready(state.people)[helper], 0)
 
 
 def observe(parts: Parts, state: FleetState, keys: Keys) -> Signals:
@@ -254,9 +266,11 @@ def observe(parts: Parts, state: FleetState, keys: Keys) -> Signals:
         robot_action=action,
         helped=helper >= 0,
         help_time=jnp.where(helper >= 0, state.humans.duration[helper], 0),
+        given=state.given,
         correction=state.correction,
         human_action=supervise(parts, state.env, keys) if parts.algorithm.sees_supervisor else None,
         link=parts.links.quality(state.links.values, state.timestep) if parts.links else jnp.ones(n, jnp.float32),
+        episode_step=state.env.episode_step,
     )
 
 

@@ -6,13 +6,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from fleetjax.allocation import helper_of
+from fleetjax.allocation import helper_of, tie_order
 from fleetjax.envs import EnvSpec
 from fleetjax.priority import PerRobot
 from fleetjax.registry import Registry
 from fleetjax.types import Plan
 
 LONGEST_DELAY = 10  # timesteps of `action_delay` at most: so many actions are remembered for each robot
+LONGEST_WAIT = 1e6  # timesteps, in which whole numbers are exact
 TIRING = 1000.0  # timesteps within which fatigue follows how busy a human is
 
 
@@ -24,11 +25,14 @@ class HumanModel(NamedTuple):
         available: `(aux, key) -> bool[M]`, the humans who are there.
         act: `(aux, Plan, action f32[N, A], key) -> (aux, action f32[N, A], given bool[N])`: what humans really do, of what the
             supervisor would do, and on which robots. On the others their own policy acts, and nothing is recorded.
+        unready: `aux -> i32[M]`, for how many timesteps of the ongoing intervention each human was not ready to act; these do
+            not count for t_T, the shortest teleoperation. None = for none.
     """
 
     init: Callable[[Any, jax.Array], Any]
     available: Callable[[Any, jax.Array], jax.Array]
     act: Callable[[Any, Plan, jax.Array, jax.Array], tuple[Any, jax.Array, jax.Array]]
+    unready: Callable[[Any], jax.Array] | None = None
 
 
 class People(NamedTuple):
@@ -36,7 +40,8 @@ class People(NamedTuple):
 
     Attributes:
         robot: i32[M] whom they helped at the last timestep, -1 = nobody.
-        wait: f32[M] timesteps until they act on it.
+        wait: i32[M] timesteps until they act on it, those of the last one included.
+        unready: i32[M] timesteps of the ongoing intervention in which they waited so.
         busy: f32[M] share of the last timesteps in which they were busy, in [0, 1].
         away: bool[M].
         past: f32[N, LONGEST_DELAY, A] what the supervisor would have done on each robot, the latest first.
@@ -44,6 +49,7 @@ class People(NamedTuple):
 
     robot: jax.Array
     wait: jax.Array
+    unready: jax.Array
     busy: jax.Array
     away: jax.Array
     past: PerRobot
@@ -70,8 +76,10 @@ def make_imperfect(config: Any, spec: EnvSpec) -> HumanModel:
     """Build the model whose parameters are `action_noise` to `absence_time` of `Config`.
 
     - Takeover: a human who comes to a robot acts on it only after a takeover time, and `switching_lag` more if it comes from
-      another robot. Meanwhile the robot's policy acts; the human's time counts. Hard resets take t_R as ever.
-    - Delay: the action is the one for what the robot was in `action_delay` timesteps ago.
+      another robot. The sum becomes a whole number of timesteps by chance, so that its mean is kept. Meanwhile the robot's
+      policy acts; the human's time counts, but not for t_T: it stays until it could act for t_T timesteps. Hard resets take t_R
+      as ever.
+    - Delay: the action is the one for what the robot was in `action_delay` timesteps ago, but not before its last reset.
     - Skill: normal noise on continuous actions, and a random action in its place with `mistake_rate`.
     - Fatigue: takeover time and noise are multiplied by 1 + `fatigue` b, for the share b of recent time in which the human was
       busy.
@@ -88,22 +96,26 @@ def make_imperfect(config: Any, spec: EnvSpec) -> HumanModel:
     def init(config: Any, key: jax.Array) -> People:
         del config
         away = jax.random.uniform(key, (m,)) < absence
-        nobody, none = jnp.full(m, -1, jnp.int32), jnp.zeros(m, jnp.float32)
-        return People(nobody, none, none, away, PerRobot(jnp.zeros((n, LONGEST_DELAY, spec.action_size))))
+        nobody, none = jnp.full(m, -1, jnp.int32), jnp.zeros(m, jnp.int32)
+        past = PerRobot(jnp.zeros((n, LONGEST_DELAY, spec.action_size)))
+        return People(nobody, none, none, jnp.zeros(m, jnp.float32), away, past)
 
     def available(people: People, key: jax.Array) -> jax.Array:
         del key
         return ~people.away
 
     def act(people: People, plan: Plan, action: jax.Array, key: jax.Array) -> tuple[People, jax.Array, jax.Array]:
-        key_time, key_noise, key_whether, key_what, key_away = jax.random.split(key, 5)
+        key_time, key_round, key_noise, key_whether, key_what, key_away = jax.random.split(key, 6)
         robot, tired = plan.humans.robot, 1.0 + fatigue * people.busy
         comes = (robot >= 0) & (robot != people.robot)
         pause = takeover_times(takeover * tired, spread, key_time) + jnp.where(people.robot >= 0, lag, 0.0)
-        wait = jnp.where(comes, pause, jnp.maximum(people.wait - 1.0, 0.0))
+        whole = jnp.floor(jnp.minimum(pause, LONGEST_WAIT) + jax.random.uniform(key_round, (m,))).astype(jnp.int32)
+        wait = jnp.where(comes, whole, jnp.maximum(people.wait - 1, 0))
+        waits = (robot >= 0) & (wait > 0)
+        unready = jnp.where(plan.humans.duration > 0, people.unready, 0) + waits.astype(jnp.int32)
         helper = helper_of(plan.humans, n)
-        given = plan.teleoperated & (wait < 1.0)[helper]
-        steps = jnp.round(delay).astype(jnp.int32)[helper]
+        given = plan.teleoperated & (wait == 0)[helper]
+        steps = jnp.minimum(jnp.round(delay).astype(jnp.int32)[helper], plan.signals.episode_step)
         seen = jnp.concatenate([action[:, None], people.past.values], axis=1)
         done = jnp.take_along_axis(seen, steps[:, None, None], axis=1)[:, 0]
         deviation = (noise * tired)[helper][:, None]
@@ -117,9 +129,9 @@ def make_imperfect(config: Any, spec: EnvSpec) -> HumanModel:
         away = jnp.where(people.away, chance >= 1.0 / absence_time, chance < leaves)
         busy = people.busy + ((robot >= 0).astype(jnp.float32) - people.busy) / TIRING
         past = PerRobot(seen[:, :LONGEST_DELAY])
-        return People(robot, wait, busy, away, past), jnp.where(given[:, None], done, action), given
+        return People(robot, wait, unready, busy, away, past), jnp.where(given[:, None], done, action), given
 
-    return HumanModel(init, available, act)
+    return HumanModel(init, available, act, lambda people: people.unready)
 
 
 def _any_action(spec: EnvSpec, number: int, key: jax.Array) -> jax.Array:
@@ -128,16 +140,28 @@ def _any_action(spec: EnvSpec, number: int, key: jax.Array) -> jax.Array:
     return jax.random.uniform(key, (number, spec.action_size), minval=-1.0)
 
 
-class Links(NamedTuple):
+class Lines(NamedTuple):
     """The robots' connections to the humans.
 
     Attributes:
-        init: `key -> bool[N]`, which links work at t = 0.
-        quality: `(works bool[N], timestep i32[]) -> f32[N]`, the chance that each works at this timestep: `Signals.link`.
+        works: bool[N] whether each worked at the last timestep.
+        poor: bool[N] which are poor, in models with poor and good ones.
     """
 
-    init: Callable[[jax.Array], jax.Array]
-    quality: Callable[[jax.Array, jax.Array], jax.Array]
+    works: jax.Array
+    poor: jax.Array
+
+
+class Links(NamedTuple):
+    """How connections work and fail.
+
+    Attributes:
+        init: `key -> Lines`, at t = 0.
+        quality: `(Lines, timestep i32[]) -> f32[N]`, the chance that each works at this timestep: `Signals.link`.
+    """
+
+    init: Callable[[jax.Array], Lines]
+    quality: Callable[[Lines, jax.Array], jax.Array]
 
 
 def draw(quality: jax.Array, key: jax.Array) -> jax.Array:
@@ -154,10 +178,11 @@ def make_gilbert_elliott(config: Any) -> Links:
     """
     failure, repair = config.link_failure_rate, config.link_repair_rate
 
-    def init(key: jax.Array) -> jax.Array:
-        return jax.random.uniform(key, (config.num_robots,)) >= failure / jnp.maximum(failure + repair, 1e-9)
+    def init(key: jax.Array) -> Lines:
+        works = jax.random.uniform(key, (config.num_robots,)) >= failure / jnp.maximum(failure + repair, 1e-9)
+        return Lines(works, jnp.zeros(config.num_robots, bool))
 
-    return Links(init, lambda works, timestep: jnp.where(works, 1.0 - failure, repair))
+    return Links(init, lambda lines, timestep: jnp.where(lines.works, 1.0 - failure, repair))
 
 
 POOR, GOOD, POOR_SHARE = 0.2, 0.9, 0.7  # chances that links work, and the share of robots with poor ones
@@ -165,28 +190,39 @@ SWAP_BEGINS, SWAP_ENDS = 0.2, 0.8  # shares of the run
 
 
 def make_unequal(config: Any) -> Links:
-    """Links of which the first 70 % work with chance 0.2, the others with 0.9, at each timestep.
+    """Links of which a random 70 % work with chance 0.2, the others with 0.9, at each timestep.
 
-    Reference: the static scenario of ASA's published code (Fleet-Supervisor-Allocation).
+    Reference: the static scenario of ASA's published code (Fleet-Supervisor-Allocation). There links are drawn once, when a
+    human is assigned, and hard resets need them too: a human whose link fails does not come at all.
     """
-    chance = jnp.where(jnp.arange(config.num_robots) < round(POOR_SHARE * config.num_robots), POOR, GOOD)
-    return Links(lambda key: draw(chance, key), lambda works, timestep: chance.astype(jnp.float32))
+
+    def init(key: jax.Array) -> Lines:
+        n = config.num_robots
+        poor = jnp.zeros(n, bool).at[tie_order(key, n)[: int(POOR_SHARE * n)]].set(True)
+        return Lines(jnp.ones(n, bool), poor)
+
+    def quality(lines: Lines, timestep: jax.Array) -> jax.Array:
+        del timestep
+        return jnp.where(lines.poor, POOR, GOOD).astype(jnp.float32)
+
+    return Links(init, quality)
 
 
 def make_swapping(config: Any) -> Links:
     """Links as `make_unequal` has them, whose chances change over to each other's between 20 % and 80 % of the run, linearly.
 
-    Reference: the changing scenario of ASA's published code (Fleet-Supervisor-Allocation).
+    Reference: the changing scenario of ASA's published code (Fleet-Supervisor-Allocation), with the differences that
+    `make_unequal` names.
     """
-    chance = make_unequal(config).quality(jnp.zeros(0), jnp.int32(0))
+    init, before = make_unequal(config)
 
-    def quality(works: jax.Array, timestep: jax.Array) -> jax.Array:
-        del works
+    def quality(lines: Lines, timestep: jax.Array) -> jax.Array:
         done = timestep.astype(jnp.float32) / config.num_steps
         share = jnp.clip((done - SWAP_BEGINS) / (SWAP_ENDS - SWAP_BEGINS), 0.0, 1.0)
+        chance = before(lines, timestep)
         return chance + share * (POOR + GOOD - 2.0 * chance)
 
-    return Links(lambda key: draw(chance, key), quality)
+    return Links(init, quality)
 
 
 # Each is `(config, EnvSpec) -> HumanModel`; None = a perfect human, who needs no model.

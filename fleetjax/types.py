@@ -60,10 +60,13 @@ class Signals(NamedTuple):
         robot_action: f32[N, A] what the robots' policy would do.
         helped: bool[N] whether a human helped the robot at the last timestep.
         help_time: i32[N] timesteps of that help so far; 0 without help.
+        given: bool[N] whether a human's action was done at the last timestep. A human may help and not act: in a hard reset,
+            before it has taken over, or over a link that does not work.
         correction: f32[N] mean squared difference between the human's and the robot's action, if the robot was teleoperated
-            at the last timestep; else 0.
+            at the last timestep; else 0. It is also 0 where both did the same, as discrete actions often are.
         human_action: f32[N, A] what the supervisor would do; None unless the algorithm has `sees_supervisor`.
         link: f32[N] chance that the link to each robot works at this timestep; 1 with `link_model = "perfect"`.
+        episode_step: i32[N] control steps of the robot since its reset.
     """
 
     violation: jax.Array
@@ -76,9 +79,11 @@ class Signals(NamedTuple):
     robot_action: Any = None
     helped: Any = None
     help_time: Any = None
+    given: Any = None
     correction: Any = None
     human_action: Any = None
     link: Any = None
+    episode_step: Any = None
 
 
 class Plan(NamedTuple):

@@ -42,6 +42,8 @@ BAD_RUNS = {
     "not finite": ((*RUN, "--learning-rate", "inf"), "learning_rate = inf must be at least 0"),
     "no number": ((*RUN, "--learning-rate", "fast"), "--learning-rate: 'fast' must be a number"),
     "batch": ((*RUN, "--batch-size", 600), "batch_size = 600 is larger than the data"),
+    "no number for a human": ((*RUN, "--takeover-time", "fast"), "--takeover-time: 'fast' must be a number"),
+    "no file for humans": ((*RUN, "--takeover-time", "@none.txt"), "--takeover-time: none.txt cannot be read"),
     "no layers": ((*RUN, "--hidden-sizes", 0), "hidden_sizes = (0,)"),
     "seed": ((*RUN, "--seed", -1), "--seed: '-1' must be a whole number from 0 to 4294967295"),
     "large seed": ((*RUN, "--seed", 2**32), "--seed: '4294967296' must be a whole number"),

@@ -10,7 +10,6 @@ from compiling import compiled
 
 import fleetjax
 from fleetjax import HumanState, Signals, envs, priority, supervisors
-from fleetjax.allocation import allocate
 from fleetjax.config import get_value
 from fleetjax.learning.estimators import ESTIMATORS
 from fleetjax.physics.base import PhysicsState
@@ -258,17 +257,20 @@ def make_signals(key: jax.Array) -> Signals:
         robot_action=jax.random.uniform(keys[7], (24, 2), minval=-1.0),
         helped=helped,
         help_time=helped.astype(jnp.int32),
+        given=helped & ~violation,
         correction=jnp.where(helped & ~violation, draws[0], 0.0),
         human_action=jax.random.uniform(keys[8], (24, 2), minval=-1.0),
         link=jnp.ones(24, jnp.float32),
+        episode_step=jnp.arange(24),
     )
 
 
 def decide(name, config, signals, aux, key):
-    """Score, then give six humans to the robots."""
-    score, aux = priority.get_algorithm(name).make_priority(config).score(signals, aux, key)
+    """Score, then give six humans to the robots, by the algorithm's own allocator."""
+    algorithm = priority.get_algorithm(name)
+    score, aux = algorithm.make_priority(config).score(signals, aux, key)
     humans = HumanState(jnp.full(6, -1, jnp.int32), jnp.zeros(6, jnp.int32))
-    return score, aux, allocate(score, humans, jnp.full(24, 5), key).robot
+    return score, aux, algorithm.make_allocate(config)(score, humans, jnp.full(24, 5), key, None, signals).robot
 
 
 @functools.cache
@@ -323,3 +325,50 @@ def test_algorithm_gives_no_human_for_nan(name):
         assert not np.any((score > 0) & (expected == 0))
         assert np.all(expected[robot[robot >= 0]] > 0)
         assert len(np.unique(robot[robot >= 0])) == np.sum(robot >= 0)
+
+
+@functools.cache
+def jitted_allocate(make_allocate):
+    """Return a compiled allocator; algorithms that share their maker share it."""
+    return compiled(lambda config, *args: make_allocate(config)(*args))
+
+
+def shared_settings():
+    """Return settings of any algorithm, for allocators that read none of its own."""
+    return fleetjax.make_config("navigation", num_robots=24, num_humans=6)
+
+
+@each_algorithm
+def test_algorithm_allocates(name):
+    """Humans who are bound and there stay, nobody comes to a score of 0 or NaN, no robot has two, and who is away has none."""
+    make_allocate = priority.get_algorithm(name).make_allocate
+    own = make_allocate is not priority.Algorithm.make_allocate
+    config = settings_of(name) if own else shared_settings()
+    came = stayed = 0
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        score = jnp.asarray(np.where(rng.random(24) < 0.3, 0, rng.random(24)), jnp.float32).at[3].set(jnp.nan)
+        score = score if seed < 3 else jnp.zeros(24)
+        robot = np.where(rng.random(6) < 0.3, -1, rng.permutation(24)[:6])
+        duration = np.where(robot < 0, 0, rng.integers(0, 8, 6))
+        min_time, available = rng.integers(1, 7, 24), rng.random(6) < 0.8
+        humans = HumanState(jnp.asarray(robot, jnp.int32), jnp.asarray(duration, jnp.int32))
+        key, signals = jax.random.key(seed), make_signals(jax.random.key(seed))
+        for there in (None, jnp.asarray(available)):
+            args = (score, humans, jnp.asarray(min_time, jnp.int32), key, there, signals)
+            after = jitted_allocate(make_allocate)(config, *args)
+            assert types(after) == types(humans)
+            assert_same(after, make_allocate(config)(*args))
+            now, time = np.asarray(after.robot), np.asarray(after.duration)
+            present = np.ones(6, bool) if there is None else available
+            bound = present & (robot >= 0) & (duration < min_time[robot])
+            stays = (robot >= 0) & (now == robot)
+            np.testing.assert_array_equal(now[bound], robot[bound])
+            np.testing.assert_array_equal(time, np.where(stays, duration, 0))
+            assert np.all(now[~present] == -1)
+            assert len(np.unique(now[now >= 0])) == np.sum(now >= 0)
+            free = ~bound & (now >= 0)
+            assert np.all(np.asarray(score)[now[free]] > 0)
+            came, stayed = came + np.sum(free), stayed + np.sum(bound)
+    assert came > 0
+    assert stayed > 0

@@ -407,6 +407,9 @@ def test_beyond_this_machine_addresses_and_its_own_name_are_let_in_and_other_nam
         (["navigation", "--humans", "2", "--timeout", "0"], "timeout = 0"),
         (["navigation", "--humans", "200"], "num_humans = 200"),
         (["navigation", "--fill", "robots"], "--fill"),
+        (["navigation", "--takeover-time", "20", "--fatigue", "1"], "takeover_time, fatigue cannot be used in a console"),
+        (["navigation", "--human-model", "imperfect"], "human_model = 'imperfect' cannot be used in a console"),
+        (["navigation", "--link-model", "unequal"], "link_model = 'unequal' cannot be used in a console"),
         (["navigation", "--checkpoint-every", "5"], "--checkpoint-every"),
         ([], "ENV is missing; choose one of navigation, block_push\n"),
     ],
@@ -415,6 +418,12 @@ def test_what_cannot_be_used_is_refused_in_one_line(arguments, reason, capsys, t
     monkeypatch.chdir(tmp_path)
     assert reason in refused(capsys, "console", *arguments)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_engine_takes_no_models_of_people():
+    config = fleetjax.make_config("navigation", takeover_time=20.0)
+    with pytest.raises(ValueError, match="takeover_time cannot be used in a console, where people have their own times"):
+        Engine(config, jax.random.key(0), envs.make("navigation"))
 
 
 def test_environments_without_controls_are_refused(capsys, monkeypatch):

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 import fleetjax
 from fleetjax import HumanState, Signals, priority
 from fleetjax.fleet import make_parts
-from fleetjax.learning import novelty
+from fleetjax.learning import buffer, help, novelty
+from fleetjax.learning.critic import Transition
 from fleetjax.priority import coverage, quantiles, whittle
 
 N, ACTIONS = 12, 3
@@ -26,8 +27,9 @@ def signals_at(t: int, seed: int = 0, **changes) -> Signals:
     flags = [rng.random(N) < 0.2, rng.random(N) < 0.4]
     violation, helped = map(jnp.asarray, flags)
     unit = lambda *shape: jnp.asarray(rng.random(shape), jnp.float32)  # noqa: E731
-    correction = jnp.where(helped & ~violation, unit(N), 0.0)
-    names = ("safety", "goal", "discrepancy", "novelty", "intervention", "divergence")
+    given = helped & ~violation & jnp.asarray(rng.random(N) < 0.8)
+    correction = jnp.where(given & jnp.asarray(rng.random(N) < 0.8), unit(N), 0.0)  # some humans agree with their robots
+    names = ("safety", "goal", "discrepancy", "mean_discrepancy", "novelty", "intervention", "divergence")
     signals = Signals(
         violation=violation,
         uncertainty=unit(N) * 0.2,
@@ -39,6 +41,7 @@ def signals_at(t: int, seed: int = 0, **changes) -> Signals:
         robot_action=2 * unit(N, ACTIONS) - 1,
         helped=helped,
         help_time=helped.astype(jnp.int32),
+        given=given,
         correction=correction,
         human_action=2 * unit(N, ACTIONS) - 1,
         link=jnp.ones(N, jnp.float32),
@@ -71,7 +74,7 @@ def ranks(asking, violation) -> list[float]:
 
 
 def numpy_teleoperated(s: Signals) -> np.ndarray:
-    return np.asarray(s.helped & ~s.violation & (s.correction > 0))
+    return np.asarray(s.given & ~s.violation)
 
 
 # Running quantiles
@@ -119,7 +122,8 @@ def test_the_quantile_of_nothing_is_0():
 def test_a_gate_at_a_rate_is_asked_at_that_rate_while_the_signal_falls(scale):
     """Uncertainty falls by a fifth over 600 timesteps; a tenth of the robots ask nevertheless."""
     rng = np.random.default_rng(0)
-    alone = {"violation": jnp.zeros(N, bool), "helped": jnp.zeros(N, bool), "correction": jnp.zeros(N)}
+    none = jnp.zeros(N, bool)
+    alone = {"violation": none, "helped": none, "given": none, "correction": jnp.zeros(N)}
     levels = scale * rng.random((600, N)) * np.exp(-np.arange(600) / 3000)[:, None]
     steps = [signals_at(t, uncertainty=jnp.asarray(level, jnp.float32), **alone) for t, level in enumerate(levels)]
     parameters = {"quantile_rate": 0.1, "quantile_memory": 50.0}
@@ -146,23 +150,23 @@ def test_quantile_ensemble():
 def test_thrifty_quantile(has_goal):
     steps = [signals_at(t) for t in range(30)]
     if not has_goal:
-        steps = [s._replace(estimates={}) for s in steps]
-    doubt, chance, number, total = Oracle(1000.0), Oracle(1000.0), 0.0, 0.0
-    kept = 0
+        steps = [s._replace(estimates={"mean_discrepancy": s.estimates["mean_discrepancy"]}) for s in steps]
+    doubt, chance, kept, agreeing = Oracle(1000.0), Oracle(1000.0), 0, 0
     for s, score in zip(steps, scores_of("thrifty_quantile", steps, thrifty_rate=0.2), strict=True):
         u, g = np.asarray(s.uncertainty), np.asarray(s.goal if has_goal else 1 - s.risk)
         alone, taught = ~np.asarray(s.violation | s.helped), numpy_teleoperated(s)
         doubt.add(u, alone)
         chance.add(g, alone)
-        number, total = number * np.exp(-1e-3) + taught.sum(), total * np.exp(-1e-3) + np.asarray(s.correction)[taught].sum()
         (u_low, u_high), (g_low, g_high), (m_low, m_high) = doubt.bounds(0.8), chance.bounds(0.2), chance.bounds(0.5)
-        agrees = np.asarray(s.correction) < total / max(number, 1e-9)
+        agrees = np.asarray(s.correction) < np.asarray(s.estimates["mean_discrepancy"])
         sure = (u > u_high) | (g < g_low) | (taught & ~(agrees & (g > m_low)))
         sure_not = ~((u > u_low) | (g < g_high) | (taught & ~(agrees & (g > m_high)))) & ~np.asarray(s.violation)
         assert np.all(score[sure] > 0)
         assert not np.any(score[sure_not])
-        kept += np.sum(taught & sure & ~((u > u_low) | (g < g_high)))
+        unasked = taught & sure & ~((u > u_low) | (g < g_high))
+        kept, agreeing = kept + np.sum(unasked), agreeing + np.sum(unasked & (np.asarray(s.correction) == 0))
     assert kept > 0
+    assert agreeing > 0  # the human does what the robot would, but success is not likely
 
 
 def test_safe_dagger():
@@ -220,12 +224,15 @@ def test_the_distance_to_the_kth_neighbour():
     rng = np.random.default_rng(0)
     obs, states = rng.normal(size=(7, 4)).astype(np.float32), rng.normal(size=(30, 4)).astype(np.float32)
     apart = np.sqrt(np.mean((obs[:, None] - states) ** 2, axis=-1))
-    np.testing.assert_allclose(novelty.distance_to(obs, states, 5), np.sort(apart, axis=1)[:, 4], rtol=1e-3)
+    for known in (np.ones(30, bool), np.arange(30) < 20):
+        expected = np.sort(apart[:, known], axis=1)[:, 4]
+        np.testing.assert_allclose(novelty.distance_to(obs, states, known, 5), expected, rtol=1e-3)
+    assert np.all(np.isinf(novelty.distance_to(obs, states, np.arange(30) < 4, 5)))
 
 
 def test_conformal_widens_where_labels_fall_outside_and_only_when_labelled():
     steps = [signals_at(t) for t in range(12)]
-    quiet = {"helped": jnp.zeros(N, bool), "correction": jnp.zeros(N)}
+    quiet = {"helped": jnp.zeros(N, bool), "given": jnp.zeros(N, bool), "correction": jnp.zeros(N)}
     steps[5] = steps[5]._replace(**quiet)
     half, spread = 1.0, np.ones(N)
     for s, score in zip(steps, scores_of("conformal", steps, conformal_gain=0.5, conformal_threshold=0.7), strict=True):
@@ -319,47 +326,87 @@ def test_whittle_counts_transitions_with_and_without_help():
         before = state
 
 
-def numpy_coverage(weight, alike, bound, number, threshold, link):
-    """Return the robots that greedy facility location picks, in order."""
-    picked, chosen = [], [i for i in range(len(weight)) if bound[i]]
+def numpy_coverage(s, own, bound, number, threshold, link):
+    """Return the robots that greedy facility location picks, in order, as the published text has it; `own` is M's diagonal.
 
-    def covered(robots):
-        return sum(weight[i] * max((alike[i, j] for j in robots), default=0.0) for i in range(len(weight)))
-
-    for _ in range(number):
-        gains = {
-            j: (covered([*chosen, j]) - covered(chosen)) * link[j]
-            for j in range(len(weight))
-            if weight[j] > 0 and j not in chosen and not bound[j]
-        }
-        best = max(gains, key=gains.__getitem__, default=None)
-        if best is None or gains[best] < threshold:
-            break
-        picked.append(best)
-        chosen.append(best)
-    return picked
-
-
-@pytest.mark.parametrize("threshold", [0.0, 0.9])
-@pytest.mark.parametrize("seed", range(3))
-def test_asa_covers_greedily(seed, threshold):
-    link = np.random.default_rng(seed).uniform(0.2, 1.0, N).astype(np.float32)
-    s = signals_at(0, seed, link=jnp.asarray(link))
-    config = CONFIG.replace(algorithm="asa", asa_threshold=threshold, uncertainty_threshold=0.1, risk_threshold=0.3)
-    algorithm = priority.get_algorithm("asa")
-    weight, _ = algorithm.make_priority(config).score(s, (), jax.random.key(0))
-    u, r, c = (np.asarray(x, float) for x in (s.uncertainty, s.risk, s.violation))
-    expected = 0.097 * u * (u >= 0.1) + 0.903 * r * (r >= 0.3) + 1e4 * c
-    np.testing.assert_allclose(weight, expected, rtol=1e-6)
-    weight = jnp.where(s.violation, 0.0, weight)  # else sums of 10,000 hide the rest
-    humans = HumanState(jnp.array([3, -1, -1, -1], jnp.int32), jnp.array([1, 0, 0, 0], jnp.int32))
-    found = algorithm.make_allocate(config)(weight, humans, jnp.full(N, 5), jax.random.key(0), None, s)
+    M = (similarity * informativeness)^T, and 10,000 C on its diagonal alone. In the initial period `own` is 0 for violations.
+    """
     obs = np.asarray(s.obs, float)
     obs = (obs - obs.mean(0)) / obs.std(0)
     alike = 1 / (1 + 4.89 * np.sqrt(np.mean((obs[:, None] - obs) ** 2, axis=-1)))
     np.testing.assert_allclose(coverage.similarity(s.obs), alike, atol=1e-3)
-    picked = numpy_coverage(np.asarray(weight, float), alike, np.arange(N) == 3, 3, threshold, link)
+    u, r = np.asarray(s.uncertainty, float), np.asarray(s.risk, float)
+    matrix = (alike * (0.097 * np.where(u < 0.151, 0, u) + 0.903 * np.where(r < 0.198, 0, r))).T
+    np.fill_diagonal(matrix, own)
+    covered, picked = np.max(matrix * bound, axis=1), []
+    for _ in range(number):
+        gains = (np.maximum(matrix, covered[:, None]).sum(axis=0) - covered.sum()) * link
+        gains[bound | (own <= 0) | np.isin(range(len(own)), picked)] = -np.inf
+        if gains.max() < threshold:
+            break
+        picked.append(int(gains.argmax()))
+        covered = np.maximum(covered, matrix[:, picked[-1]])
+    return picked
+
+
+def numpy_own(s, early: bool) -> np.ndarray:
+    """Return what each robot covers of itself: 0.097 U + 0.903 R, and 10,000 C, but 0 for violations at first."""
+    u, r, c = (np.asarray(x, float) for x in (s.uncertainty, s.risk, s.violation))
+    own = 0.097 * u * (u >= 0.151) + 0.903 * r * (r >= 0.198) + 1e4 * c
+    return np.where(c * early > 0, 0, own)
+
+
+@pytest.mark.parametrize("early", [False, True])
+@pytest.mark.parametrize("threshold", [0.0, 0.9])
+@pytest.mark.parametrize("seed", range(3))
+def test_asa_covers_greedily(seed, threshold, early):
+    rng = np.random.default_rng(seed)
+    link, violation = rng.uniform(0.2, 1.0, N).astype(np.float32), np.isin(range(N), [1, 5])
+    s = signals_at(0, seed, link=jnp.asarray(link), violation=jnp.asarray(violation))
+    config = CONFIG.replace(algorithm="asa", asa_threshold=threshold, initial_period=5 * early)
+    algorithm, own = priority.get_algorithm("asa"), numpy_own(s, early)
+    score, _ = algorithm.make_priority(config).score(s, (), jax.random.key(0))
+    np.testing.assert_allclose(score, own, rtol=1e-6)
+    humans = HumanState(jnp.array([3, -1, -1, -1], jnp.int32), jnp.array([1, 0, 0, 0], jnp.int32))
+    found = algorithm.make_allocate(config)(score, humans, jnp.full(N, 5), jax.random.key(0), None, s)
+    picked = numpy_coverage(s, own, np.arange(N) == 3, 3, threshold, link)
     assert np.asarray(found.robot).tolist() == [3, *picked, *[-1] * (3 - len(picked))]
+    assert early != bool({1, 5} & set(picked))
+
+
+def asa_on(violation, risk, obs, **humans):
+    """Return whom two humans help of robots that see `obs` f32[K, O], 40 timesteps after the start."""
+    number = len(risk)
+    config = CONFIG.replace(algorithm="asa", num_robots=number, num_humans=2)
+    values = {name: jnp.zeros(number) for name in ("uncertainty", "goal")}
+    s = Signals(
+        violation=jnp.array(violation),
+        risk=jnp.array(risk),
+        timestep=jnp.int32(40),
+        obs=jnp.asarray(obs, jnp.float32),
+        link=humans.get("link"),
+        **values,
+    )
+    algorithm = priority.get_algorithm("asa")
+    score, _ = algorithm.make_priority(config).score(s, (), jax.random.key(0))
+    crew = humans.get("crew", HumanState(jnp.full(2, -1, jnp.int32), jnp.zeros(2, jnp.int32)))
+    allocate = algorithm.make_allocate(config)
+    return allocate(score, crew, jnp.full(number, 5), jax.random.key(0), humans.get("available"), s).robot.tolist()
+
+
+def test_a_violation_is_covered_by_its_own_robot_alone():
+    """A neighbour with a better link, at little risk, gains nothing from a violation beside it."""
+    obs = [[0.0, 0.0], [0.01, 0.0], [5.0, 5.0], [5.2, 5.1]]
+    link = jnp.array([0.2, 0.9, 0.9, 0.9])
+    assert asa_on([True, False, False, False], [0.0, 0.4, 0.9, 0.5], obs, link=link) == [0, 2]
+    assert asa_on([False] * 4, [0.9, 0.4, 0.9, 0.0], obs) == [0, 2]
+
+
+def test_a_robot_whose_human_has_left_competes_again():
+    crew = HumanState(jnp.array([0, -1], jnp.int32), jnp.array([1, 0], jnp.int32))
+    options = {"violation": [False] * 3, "risk": [0.9, 0.8, 0.7], "obs": [[0.0], [4.0], [9.0]], "crew": crew}
+    assert asa_on(**options) == [0, 1]
+    assert asa_on(**options, available=jnp.array([False, True])) == [-1, 0]
 
 
 def test_asa_leaves_violations_in_the_initial_period():
@@ -368,8 +415,11 @@ def test_asa_leaves_violations_in_the_initial_period():
         scorer("asa")(CONFIG.replace(algorithm="asa", initial_period=period), s, (), jax.random.key(0))[0]
         for period in (11, 10)
     )
-    assert np.any(s.violation)
-    np.testing.assert_allclose(after - before, 1e4 * np.asarray(s.violation), rtol=1e-3)
+    violation = np.asarray(s.violation)
+    assert np.any(violation)
+    assert not np.any(before[violation])
+    assert np.all(after[violation] >= 1e4)
+    np.testing.assert_array_equal(before[~violation], after[~violation])
 
 
 # Estimators, in a fleet
@@ -427,13 +477,188 @@ def test_energies_and_neighbours_tell_states_apart_that_no_human_saw():
         assert np.median(new) > 1.5 * np.median(known), name
 
 
-def test_the_radius_is_the_quantile_of_demonstrations():
+def test_references_are_different_demonstrations_and_the_radius_is_their_quantile():
     config = fleetjax.make_config("navigation", "crsail", num_robots=8, num_humans=2, num_steps=5, pretraining_steps=0)
     state = compiled(fleetjax.prepare)(config, jax.random.key(0))
     parts, seen = make_parts(config, fleetjax.envs.make("navigation")), state.estimators["novelty"]
-    known = np.asarray(state.policy.normalizer(seen.states), np.float64)
+    index, number = np.asarray(seen.source), int(state.human_data.pairs.size)
+    assert number == 500 < novelty.REFERENCES
+    assert sorted(index[index >= 0]) == list(range(number))
+    known = np.asarray(state.policy.normalizer(state.human_data.pairs.rows.obs[:number]), np.float64)
     apart = np.sqrt(np.mean((known[:, None] - known) ** 2, axis=-1))
     expected = np.quantile(np.sort(apart, axis=1)[:, novelty.NEIGHBOURS], 0.95)
     assert float(seen.radius) == pytest.approx(expected, rel=0.02)
-    value = parts.estimators["novelty"].value(seen, state.policy, seen.states, jnp.zeros((len(known), 2)))
+    value = parts.estimators["novelty"].value(seen, state.policy, seen.states[index >= 0], jnp.zeros((number, 2)))
     assert np.mean(np.asarray(value) >= 1) < 0.05
+    # New pairs fill what is free, and then take the place of others; none is there twice.
+    more = fleetjax.extend(state, 2000).human_data
+    rows = more.pairs.rows._replace(obs=more.pairs.rows.obs.at[number:].set(7.0))
+    data = more._replace(pairs=more.pairs._replace(rows=rows, added=jnp.int32(number + 1000)))
+    update = parts.estimators["novelty"].update
+    renewed = jax.lax.fori_loop(0, 400, lambda i, seen: update(seen, state.policy, data, jax.random.key(i)), seen)
+    index = np.asarray(renewed.source)
+    assert np.all(index >= 0)
+    assert len(np.unique(index)) == novelty.REFERENCES
+    np.testing.assert_array_equal(renewed.states, rows.obs[index])
+    assert 0.4 < np.mean(index < number) < 0.6  # 524 at first; a third in the end
+
+
+# Estimators, against their equations
+
+
+@functools.cache
+def taught_fleet(name: str, environment: str = "navigation"):
+    """Return the parts of a small fleet that has seen demonstrations, and its state."""
+    config = fleetjax.make_config(environment, name, num_robots=6, num_humans=2, num_steps=4, batch_size=16)
+    short = {"pretraining_steps": 3, "critic_pretraining_steps": 2, "num_critic_transitions": 30}
+    config = config.replace(num_demonstrations=40, goal_discount=0.9, **short)
+    state = compiled(fleetjax.prepare)(config, jax.random.key(0))
+    return make_parts(config, fleetjax.envs.make(environment)), state
+
+
+def loss_of_update(monkeypatch, parts, state, name: str, key) -> float:
+    """Return the loss that an estimator's gradient step descends, at its parameters before."""
+    losses = []
+
+    def spy(trained, loss, learning_rate):
+        losses.append(float(loss(trained.params)))
+        return trained
+
+    monkeypatch.setattr(help, "_descend", spy)
+    parts.estimators[name].update(state.estimators[name], state.policy, state.human_data, key)
+    return losses[0]
+
+
+def drawn(data, key, number: int):
+    """Return the pairs that a batch draws, in NumPy."""
+    index = np.asarray(buffer.draw_index(key, (number,), data.pairs.size))
+    return tuple(np.asarray(column, np.float64)[index] for column in data.pairs.rows)
+
+
+def numpy_net(parts, params, *inputs) -> np.ndarray:
+    """Return f64[K], the output of a network of the fleet's kind."""
+    layers = [params["params"][layer] for layer in sorted(params["params"])]
+    x = np.concatenate(inputs, axis=-1)
+    for i, layer in enumerate(layers):
+        x = x @ np.asarray(layer["kernel"], np.float64) + np.asarray(layer["bias"], np.float64)
+        x = np.maximum(x, 0) if i < len(layers) - 1 else x
+    return x[..., 0]
+
+
+def numpy_scaled(policy, obs) -> np.ndarray:
+    return np.asarray(policy.normalizer(jnp.asarray(obs, jnp.float32)), np.float64)
+
+
+def numpy_policy(parts, policy, obs) -> np.ndarray:
+    return np.asarray(parts.learner.predict(policy, jnp.asarray(obs, jnp.float32))[0], np.float64)
+
+
+def test_the_loss_of_the_discrepancy_classifier(monkeypatch):
+    parts, state = taught_fleet("lazy_dagger")
+    key = jax.random.key(3)
+    obs, action = drawn(state.human_data, key, 16)
+    apart = np.mean((numpy_policy(parts, state.policy, obs) - action) ** 2, axis=-1)
+    values = np.unique(apart.astype(np.float32))
+    tau = float(values[len(values) // 2 - 1 : len(values) // 2 + 1].mean())  # between two of them: rounding decides nothing
+    wrong = apart > tau
+    parts = make_parts(parts.config.replace(discrepancy_tau=tau), parts.env)
+    p = 1 / (1 + np.exp(-numpy_net(parts, state.estimators["discrepancy"].params, numpy_scaled(state.policy, obs))))
+    expected = -np.mean(np.where(wrong, np.log(p), np.log(1 - p)))
+    assert loss_of_update(monkeypatch, parts, state, "discrepancy", key) == pytest.approx(expected, rel=1e-4)
+    value = parts.estimators["discrepancy"].value(
+        state.estimators["discrepancy"], state.policy, jnp.asarray(obs, jnp.float32), jnp.asarray(action, jnp.float32)
+    )
+    np.testing.assert_allclose(value, p, rtol=1e-4)
+
+
+def test_the_mean_discrepancy_is_that_of_the_policy_on_human_data():
+    parts, state = taught_fleet("thrifty_quantile")
+    key, estimator = jax.random.key(3), parts.estimators["mean_discrepancy"]
+    obs, action = drawn(state.human_data, key, 16)
+    expected = np.mean((numpy_policy(parts, state.policy, obs) - action) ** 2)
+    mean = estimator.update(jnp.float32(9.0), state.policy, state.human_data, key)
+    assert float(mean) == pytest.approx(expected, rel=1e-4)
+    value = estimator.value(mean, state.policy, jnp.zeros((6, 8)), jnp.zeros((6, 2)))
+    np.testing.assert_allclose(value, [expected] * 6, rtol=1e-4)
+
+
+def test_the_targets_and_the_loss_of_the_proxy_value(monkeypatch):
+    parts, state = taught_fleet("aim")
+    proxy, policy, key = state.estimators["intervention"], state.policy, jax.random.key(3)
+    rng, size = np.random.default_rng(0), 30
+    numbers = [jnp.asarray(rng.uniform(-1, 1, (size, width)), jnp.float32) for width in (8, 2, 8)]
+    steps = Transition(*numbers, violation=jnp.arange(size) % 5 == 1, success=jnp.arange(size) % 5 == 2)
+    transitions = buffer.append(proxy.transitions, steps, jnp.ones(size, bool), overwrite=True)
+    rows = transitions.rows
+    slow = jax.tree.map(lambda x: 0.5 * x, proxy.target)  # so that the two networks differ
+    proxy = proxy._replace(transitions=transitions, target=slow)
+    state = state._replace(estimators={"intervention": proxy})
+    key_pairs, key_steps = jax.random.split(key)
+    obs, action = drawn(state.human_data, key_pairs, 16)
+    own = numpy_policy(parts, policy, obs)
+    apart = np.mean((own - action) ** 2, axis=-1)
+    index = np.asarray(buffer.draw_index(key_steps, (16,), jnp.int32(size)))
+    now, done, then = (np.asarray(rows._asdict()[name], np.float64)[index] for name in ("obs", "action", "next_obs"))
+    over = np.asarray(rows.violation | rows.success)[index]
+    assert 0 < over.sum() < 16
+    ahead = numpy_net(parts, slow, numpy_scaled(policy, then), numpy_policy(parts, policy, then))
+    target = np.where(over, 0, 0.9 * ahead)
+    value = lambda obs, action: numpy_net(parts, proxy.trained.params, numpy_scaled(policy, obs), action)  # noqa: E731
+    expected = np.mean((value(obs, action) + 1) ** 2 + (apart > apart.mean()) * (value(obs, own) - 1) ** 2)
+    expected += np.mean((value(now, done) - target) ** 2)
+    assert loss_of_update(monkeypatch, parts, state, "intervention", key) == pytest.approx(expected, rel=1e-4)
+
+
+def numpy_jeffreys(energies) -> np.ndarray:
+    p, q = (np.exp(-e) / np.exp(-e).sum(axis=-1, keepdims=True) for e in np.asarray(energies, np.float64))
+    return np.sum((p - q) * (np.log(p) - np.log(q)), axis=-1)
+
+
+def test_the_jeffreys_divergence():
+    energies = np.random.default_rng(0).normal(0, 2, (2, 7, 5))
+    np.testing.assert_allclose(help.jeffreys(jnp.asarray(energies, jnp.float32)), numpy_jeffreys(energies), rtol=1e-4)
+    assert numpy_jeffreys([[[0.0, np.log(3.0)]], [[np.log(3.0), 0.0]]])[0] == pytest.approx(np.log(3.0))
+    parts, state = taught_fleet("iifl")
+    models, policy, obs = state.estimators["divergence"], state.policy, np.asarray(state.env.obs, np.float64)
+    own = numpy_policy(parts, policy, obs)
+    key_near, key_far = jax.random.split(jax.random.key(0))
+    near = own[:, None] + 0.2 * np.asarray(jax.random.normal(key_near, (6, 4, 2)), np.float64)
+    far = np.asarray(jax.random.uniform(key_far, (6, 4, 2), minval=-1.0), np.float64)
+    actions = np.concatenate([np.clip(near, -1, 1), far], axis=1)
+    seen = np.broadcast_to(numpy_scaled(policy, obs)[:, None], (6, 8, 8))
+    energies = [numpy_net(parts, jax.tree.map(lambda x, k=k: x[k], models.params), seen, actions) for k in range(2)]
+    value = parts.estimators["divergence"].value(models, policy, state.env.obs, jnp.asarray(own, jnp.float32))
+    np.testing.assert_allclose(value, numpy_jeffreys(energies), rtol=1e-3, atol=1e-6)
+
+
+# Discrete actions
+
+
+@pytest.mark.parametrize("agree", [True, False])
+def test_who_acts_is_known_though_human_and_robot_agree(agree):
+    """With discrete actions a correction of 0 is common: the human is there, and did what the robot would."""
+    config = fleetjax.make_config("block_push", "cur", num_robots=4, num_humans=2, num_steps=4, pretraining_steps=0)
+    config = config.replace(num_demonstrations=70, critic_pretraining_steps=0, num_critic_transitions=50)
+    fleet = fleetjax.make_fleet(config, fleetjax.envs.make("block_push"))
+    state = compiled(fleetjax.prepare)(config, jax.random.key(0))
+    state, plan = compiled(fleet.plan)(state, jax.random.key(1))
+    plan = plan._replace(teleoperated=jnp.array([True, True, False, False]))
+    action = plan.robot_action if agree else jnp.roll(plan.robot_action, 1, axis=1)
+    after, _ = compiled(fleet.advance)(state, plan, action, jnp.array([True, False, True, False]), jax.random.key(1))
+    assert after.given.tolist() == [True, False, False, False]
+    assert (float(after.correction[0]) > 0) == (not agree)
+    _, then = compiled(fleet.plan)(after, jax.random.key(2))
+    assert then.signals.given.tolist() == after.given.tolist()
+
+
+def test_agreement_narrows_the_conformal_interval():
+    """Nine humans of ten agree with their robots exactly; their labels count, and q does not ratchet up."""
+    given = jnp.arange(N) < 10
+    correction = jnp.where(jnp.arange(N) == 0, 9.0, 0.0)
+    same = {"helped": given, "given": given, "correction": correction, "violation": jnp.zeros(N, bool)}
+    config = CONFIG.replace(algorithm="conformal", conformal_rate=0.2)
+    rule = priority.get_algorithm("conformal").make_priority(config)
+    memory = rule.init()
+    for t in range(20):
+        _, memory = rule.score(signals_at(t, **same), memory, jax.random.key(t))
+    assert float(memory.half) == pytest.approx(np.exp(-20 * 0.05 * 0.1), rel=1e-4)

@@ -6,15 +6,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from commands import refused
 from compiling import compiled
 
 import fleetjax
 from fleetjax import envs, humans
 from fleetjax.config import validate
 from fleetjax.fleet import make_fleet, make_parts, plan
-from fleetjax.io import plain
+from fleetjax.io import flags, plain
 from fleetjax.keys import split_keys
-from fleetjax.types import HumanState, Plan
+from fleetjax.types import HumanState, Plan, Signals
 
 N, M, A = 6, 3, 2
 SMALL = {"num_robots": 20, "num_humans": 4, "num_steps": 80, "initial_period": 5, "pretraining_steps": 30}
@@ -34,7 +35,8 @@ def planned(*robots: int) -> Plan:
     robot = jnp.array(robots, jnp.int32)
     teleoperated = jnp.zeros(N, bool).at[jnp.where(robot >= 0, robot, N)].set(True, mode="drop")
     crew = HumanState(robot, jnp.zeros(M, jnp.int32))
-    return Plan(None, jnp.zeros((N, A)), jnp.zeros(N), crew, teleoperated, jnp.zeros(N, bool))
+    signals = Signals(*[None] * 5, episode_step=jnp.full(N, 100))
+    return Plan(signals, jnp.zeros((N, A)), jnp.zeros(N), crew, teleoperated, jnp.zeros(N, bool))
 
 
 def follow(found, aux, plans, actions=None):
@@ -129,6 +131,56 @@ def test_a_late_action_is_that_of_some_timesteps_ago():
         np.testing.assert_allclose(done[late:, robot, 0], np.arange(15 - late) / 100, rtol=1e-6)
 
 
+def test_the_mean_takeover_is_kept_though_timesteps_are_whole():
+    found, aux = model(takeover_time=2.7, takeover_spread=0.0)
+    act, waits = compiled(found.act), []
+    for t in range(120):  # each human goes to another robot every timestep
+        aux, _, _ = act(aux, planned(t % 2, 2 + t % 2, 4 + t % 2), jnp.zeros((N, A)), jax.random.key(t))
+        waits.append(np.asarray(aux.wait))
+    assert set(np.unique(waits)) == {2, 3}
+    assert np.mean(waits) == pytest.approx(2.7, abs=0.08)
+
+
+def test_humans_stay_until_they_could_act_for_the_shortest_teleoperation():
+    """Humans need 7 timesteps to take over, and t_T = 3: none leaves a robot before it has acted on it 3 times."""
+    config = fleetjax.make_config("navigation", "random", random_threshold=0.0, takeover_time=7.0, takeover_spread=0.0, **SMALL)
+    config = config.replace(min_teleop_time=3)
+    step = compiled(make_fleet(config, envs.make("navigation")).step)
+    state, acted, left = compiled(fleetjax.prepare)(config, jax.random.key(0)), np.zeros(4, int), []
+    for t in range(45):
+        before = state
+        state, _ = step(state, jax.random.key(t))
+        robot, last = np.asarray(state.humans.robot), np.asarray(before.humans.robot)
+        was_reset, is_reset, given = (np.asarray(x) for x in (before.resetting, state.resetting, state.given))
+        gone = (last >= 0) & (robot != last)
+        left += acted[gone & ~was_reset[last]].tolist()
+        acted = np.where(gone | is_reset[robot], 0, acted) + given[robot]
+    assert len(left) > 5
+    assert min(left) == 3
+
+
+def test_late_actions_are_never_those_for_the_robots_last_episode():
+    found, aux = model(action_delay=3.0)
+    actions = [jnp.full((N, A), t / 100) for t in range(12)]
+    plans = [planned(0, 1, 2) for _ in range(12)]
+    for t, one in enumerate(plans):  # robots 0 and 3 are reset at t = 6
+        steps = jnp.where(jnp.arange(N) % 3 == 0, t % 6, t)
+        plans[t] = one._replace(signals=one.signals._replace(episode_step=steps))
+    done, _, _ = follow(found, aux, plans, actions)
+    np.testing.assert_allclose(100 * done[:, 1, 0], np.maximum(np.arange(12) - 3, 0), atol=1e-4)
+    np.testing.assert_allclose(100 * done[:, 0, 0], [0, 0, 0, 0, 1, 2, 6, 6, 6, 6, 7, 8], atol=1e-4)
+
+
+def test_late_discrete_actions_are_actions():
+    """All that is taught on block pushing is one of its four actions, from the first timestep on."""
+    config = fleetjax.make_config("block_push", "random", action_delay=4.0, random_threshold=0.0, num_steps=12)
+    config = config.replace(num_demonstrations=70, pretraining_steps=0)
+    data = quick_run(config, jax.random.key(0)).state.human_data
+    action = np.asarray(data.pairs.rows.action[: int(data.pairs.size)])
+    assert len(action) > 70 * config.augmented_copies
+    np.testing.assert_array_equal(np.sort(action, axis=1), np.tile([0, 0, 0, 1], (len(action), 1)))
+
+
 def test_noise_and_mistakes():
     found, aux = model(action_noise=(0.1, 0.0, 0.0), mistake_rate=(0.0, 0.3, 0.0))
     done, _, _ = follow(found, aux, [planned(0, 1, 2)] * 400, [jnp.zeros((N, A))] * 400)
@@ -185,22 +237,36 @@ def test_gilbert_and_elliotts_links(works):
     )
     links = humans.LINK_MODELS.get("gilbert_elliott")(config)
     state = links.init(jax.random.key(0))
-    assert np.mean(state) == pytest.approx(0.75, abs=0.1)
-    np.testing.assert_allclose(links.quality(jnp.full(400, works), jnp.int32(0)), 0.9 if works else 0.3, rtol=1e-6)
+    assert np.mean(state.works) == pytest.approx(0.75, abs=0.1)
+    same = state._replace(works=jnp.full(400, works))
+    np.testing.assert_allclose(links.quality(same, jnp.int32(0)), 0.9 if works else 0.3, rtol=1e-6)
     up = []
     for t in range(300):
-        state = humans.draw(links.quality(state, jnp.int32(t)), jax.random.key(t))
-        up.append(np.asarray(state))
+        state = state._replace(works=humans.draw(links.quality(state, jnp.int32(t)), jax.random.key(t)))
+        up.append(np.asarray(state.works))
     assert np.mean(up) == pytest.approx(0.3 / 0.4, abs=0.02)
 
 
 def test_the_scenarios_of_unequal_links():
     config = fleetjax.make_config("navigation", num_robots=10, num_steps=100, link_model="swapping")
-    for t, poor, good in ((0, 0.2, 0.9), (20, 0.2, 0.9), (50, 0.55, 0.55), (80, 0.9, 0.2), (99, 0.9, 0.2)):
-        chance = humans.LINK_MODELS.get("swapping")(config).quality(jnp.ones(10, bool), jnp.int32(t))
-        np.testing.assert_allclose(chance, [poor] * 7 + [good] * 3, rtol=1e-5)
-    chance = humans.LINK_MODELS.get("unequal")(config).quality(jnp.ones(10, bool), jnp.int32(99))
-    np.testing.assert_allclose(chance, [0.2] * 7 + [0.9] * 3, rtol=1e-6)
+    chosen = set()
+    for seed in range(3):
+        swapping, unequal = (humans.LINK_MODELS.get(name)(config) for name in ("swapping", "unequal"))
+        lines = swapping.init(jax.random.key(seed))
+        assert_same(lines, unequal.init(jax.random.key(seed)))
+        assert lines.poor.sum() == 7
+        chosen.add(tuple(np.asarray(lines.poor).tolist()))
+        for t, poor, good in ((0, 0.2, 0.9), (20, 0.2, 0.9), (50, 0.55, 0.55), (80, 0.9, 0.2), (99, 0.9, 0.2)):
+            expected = np.where(lines.poor, poor, good)
+            np.testing.assert_allclose(swapping.quality(lines, jnp.int32(t)), expected, rtol=1e-5)
+        np.testing.assert_allclose(unequal.quality(lines, jnp.int32(99)), np.where(lines.poor, 0.2, 0.9), rtol=1e-6)
+    assert len(chosen) == 3
+
+
+def test_poor_links_stay_poor_through_a_run():
+    lines = result_of(link_model="unequal").state.links.values
+    assert lines.poor.sum() == 14
+    assert not lines.works.all()
 
 
 def test_no_action_arrives_over_a_link_that_does_not_work():
@@ -255,6 +321,17 @@ def test_values_for_each_human_are_written_and_read():
     again = plain.from_plain(plain.to_plain(config))
     assert plain.to_plain(config)["action_noise"] == [0.1, 0.2]
     assert_same(again.action_noise, config.action_noise)
+
+
+def test_a_file_holds_a_value_for_each_human(tmp_path, capsys):
+    times = tmp_path / "times.txt"
+    three = ("run", "navigation", "--num-humans", "3", "--takeover-time", f"@{times}")
+    times.write_text("1 2.5\n4e1\n")
+    assert flags.parse(three).takeover_time == (1.0, 2.5, 40.0)
+    times.write_text("1 2")
+    assert "takeover_time has 2 values for num_humans = 3" in refused(capsys, *three)
+    times.write_text("1 2 soon")
+    assert "--takeover-time: 'soon' must be a number" in refused(capsys, *three)
 
 
 @pytest.mark.parametrize(

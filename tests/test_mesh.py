@@ -8,14 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import compiled
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
 import fleetjax
-from fleetjax import sharding
+from fleetjax import priority, sharding
 from fleetjax.allocation import choose
 from fleetjax.experiment import step_once
+from fleetjax.humans import HUMAN_MODELS, LINK_MODELS
 from fleetjax.learning import buffer
 from fleetjax.priority import lexicographic
 
@@ -121,6 +123,53 @@ def test_a_timestep_from_the_same_state_agrees_to_rounding(algorithm, environmen
     np.testing.assert_array_equal(one.human_data.resample, there.human_data.resample)
     for here, elsewhere in zip(jax.tree.leaves(one.policy.params), jax.tree.leaves(there.policy.params), strict=True):
         np.testing.assert_allclose(here, elsewhere, rtol=1e-3, atol=1e-5)
+
+
+step_alone, step_on_mesh = (compiled(partial(fleetjax.run, mesh=mesh)) for mesh in (None, mesh_of()))
+
+
+def assert_a_step_agrees(config):
+    """After some timesteps on one device, the next is the same on eight: who helps whom, and what is remembered."""
+    key = jax.random.key(4)
+    state = compiled(fleetjax.prepare)(config, key)
+    for _ in range(6):
+        state = step_alone(config, key, state).state
+    alone, divided = (step(config, key, state).state for step in (step_alone, step_on_mesh))
+    for name in ("robot", "duration"):
+        np.testing.assert_array_equal(getattr(alone.humans, name), getattr(divided.humans, name))
+    for name in ("priority", "people", "links", "given"):
+        here, there = (jax.tree.leaves(getattr(after, name)) for after in (alone, divided))
+        for one, other in zip(here, there, strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5, err_msg=name)
+    return alone
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", fleetjax.list_algorithms())
+def test_every_algorithm_helps_the_same_robots_on_a_mesh(name):
+    own = priority.get_algorithm(name).defaults(small("constraint"))
+    humans = {"num_humans": own.get("num_humans", SMALL["num_humans"])}
+    assert_a_step_agrees(small(name, num_steps=1, initial_period=0, human_capacity=500, **humans))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("links", LINK_MODELS.names())
+@pytest.mark.parametrize("people", HUMAN_MODELS.names())
+def test_people_and_links_are_the_same_on_a_mesh(people, links):
+    given = {
+        "takeover_time": 2.3,
+        "action_delay": 2.0,
+        "action_noise": 0.1,
+        "mistake_rate": 0.1,
+        "absence": 0.2,
+        "fatigue": 1.0,
+    }
+    given = given if people != "perfect" else {}
+    config = small(
+        "random", num_steps=1, human_capacity=500, random_threshold=0.0, human_model=people, link_model=links, **given
+    )
+    after = assert_a_step_agrees(config)
+    assert int(after.human_data.pairs.size) > SMALL["num_demonstrations"]
 
 
 def test_where_nothing_rounds_a_run_agrees_to_the_bit():

@@ -29,6 +29,7 @@ def check(config: Config, *, host: str, port: int, token: str | None, interval: 
     Raises:
         ValueError: if it cannot be used.
     """
+    controls.check_people(config)
     controls.controls_of(envs.make(config.environment, config.backend))
     if any(importlib.util.find_spec(name) is None for name in NEEDED):
         raise ValueError('the console needs a web server; run pip install ".[console]" in the source folder')

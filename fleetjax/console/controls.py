@@ -3,9 +3,12 @@
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
+from fleetjax.config import Config
 from fleetjax.envs import Env
+from fleetjax.field import OF_HUMANS, SHAPES_OF_HUMANS
 
 
 class Controls(NamedTuple):
@@ -30,6 +33,23 @@ CONTROLS: dict[str, Controls] = {
         "push", False, {"right": (1, 0, 0, 0), "up": (0, 1, 0, 0), "left": (0, 0, 1, 0), "down": (0, 0, 0, 1)}
     ),
 }
+
+
+def check_people(config: Config) -> None:
+    """Check that no models of people and links are asked for, which a console has none of.
+
+    Raises:
+        ValueError: if there are; the message names the fields.
+    """
+    if config.human_model != "perfect":
+        names = [name for name in OF_HUMANS if name not in SHAPES_OF_HUMANS]
+        given = [name for name in names if any(np.any(np.asarray(x) != 0) for x in jax.tree.leaves(getattr(config, name)))]
+        raise ValueError(
+            f"{', '.join(given) or f'human_model = {config.human_model!r}'} cannot be used in a console, where people have "
+            'their own times and make their own mistakes; omit it, or use "fleetjax run"'
+        )
+    if config.link_model != "perfect":
+        raise ValueError(f'link_model = {config.link_model!r} cannot be used in a console; omit it, or use "fleetjax run"')
 
 
 def controls_of(env: Env) -> Controls:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fleetjax.config import Config
+from fleetjax.console.controls import check_people
 from fleetjax.envs import Env
 from fleetjax.experiment import prepare
 from fleetjax.fleet import FleetState, make_fleet, make_parts, supervise
@@ -120,16 +121,20 @@ class Engine:
     """A fleet of one run, compiled once, before its first timestep.
 
     Args:
-        config: configuration, validated.
+        config: configuration, validated; without models of people and links.
         key: random key of the run.
         env: the environment.
         num_pictures: numbers of robots that `pictures` may be asked for.
 
     Attributes:
         state: FleetState at the start of the timestep.
+
+    Raises:
+        ValueError: if the configuration has such a model.
     """
 
     def __init__(self, config: Config, key: jax.Array, env: Env, *, num_pictures: Sequence[int] = ()):
+        check_people(config)
         self.config = config
         pool = ThreadPoolExecutor(1)  # this thread only waits: an interrupt within JAX's own code could get lost
         try:

@@ -72,6 +72,7 @@ _SHIPPED = {
     "safety": _of_critic("safety"),
     "goal": _of_critic("goal"),
     "discrepancy": help.make_discrepancy,
+    "mean_discrepancy": help.make_mean_discrepancy,
     "intervention": help.make_intervention,
     "divergence": help.make_divergence,
     "novelty": novelty.make_novelty,

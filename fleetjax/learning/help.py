@@ -1,4 +1,4 @@
-"""Estimators that learn from human data when help is due: chance of a discrepancy, proxy value of interventions, energies."""
+"""Estimators that learn from human data when help is due: discrepancies, proxy value of interventions, energies."""
 
 from typing import Any, NamedTuple
 
@@ -83,6 +83,27 @@ def make_discrepancy(config: Config, env: Env, learner: Learner, supervisor: Sup
     return Estimator(init, value, lambda state, steps, moving: state, update)
 
 
+def make_mean_discrepancy(config: Config, env: Env, learner: Learner, supervisor: Supervisor) -> Estimator:
+    """Mean squared difference between robot's and human's action over a batch of all human data, the same for every robot.
+
+    It is computed anew at each gradient step, for the policy that there is then.
+
+    Reference: Hoque et al., ThriftyDAgger, 2021: the threshold at which humans hand back.
+    """
+    del env, supervisor
+
+    def mean(policy: PolicyState, data: HumanData, key: jax.Array) -> jax.Array:
+        pairs, known = _draw(data, key, config.batch_size)
+        return known * jnp.mean((learner.predict(policy, pairs.obs)[0] - pairs.action) ** 2)
+
+    return Estimator(
+        init=lambda key, data, policy: mean(policy, data, key),
+        value=lambda state, policy, obs, robot_action: jnp.full(obs.shape[0], state),
+        append=lambda state, steps, moving: state,
+        update=lambda state, policy, data, key: mean(policy, data, key),
+    )
+
+
 class Proxy(NamedTuple):
     """A network, its slow copy, and a ring of the fleet's transitions."""
 
@@ -146,6 +167,12 @@ def make_intervention(config: Config, env: Env, learner: Learner, supervisor: Su
     return Estimator(init, value, append, update)
 
 
+def jeffreys(energies: jax.Array) -> jax.Array:
+    """Return f32[...], the Jeffreys divergence of the two softmaxes of -`energies` f32[2, ..., P] over P proposals."""
+    logs = jax.nn.log_softmax(-energies, axis=-1)
+    return jnp.sum((jnp.exp(logs[0]) - jnp.exp(logs[1])) * (logs[0] - logs[1]), axis=-1)
+
+
 def make_divergence(config: Config, env: Env, learner: Learner, supervisor: Supervisor) -> Estimator:
     """Jeffreys divergence of two energy models of the human's action: sum_a (p_1 - p_2) (log p_1 - log p_2).
 
@@ -184,8 +211,7 @@ def make_divergence(config: Config, env: Env, learner: Learner, supervisor: Supe
         # The same noise at every timestep: what changes is what the models say.
         actions = propose(robot_action, jax.random.key(0))
         energies = jax.vmap(energy, (0, None, None))(state.params, policy.normalizer(obs), actions)
-        logs = jax.nn.log_softmax(-energies, axis=-1)
-        return jnp.sum((jnp.exp(logs[0]) - jnp.exp(logs[1])) * (logs[0] - logs[1]), axis=-1)
+        return jeffreys(energies)
 
     def update(state: Trained, policy: PolicyState, data: HumanData, key: jax.Array) -> Trained:
         key_pairs, key_actions = jax.random.split(key)

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 
+from fleetjax import sharding
 from fleetjax.allocation import Allocator, allocate, is_bound
 from fleetjax.field import PARAMETERS
 from fleetjax.priority.base import Algorithm, Priority, stateless
@@ -16,28 +17,36 @@ NEARNESS = 4.89  # how fast similarity falls with distance
 
 
 def asa(config) -> Priority:
-    """Weights of robots for the allocator `by_coverage`: 0.097 U + 0.903 R, and 10,000 C after the initial period.
+    """What robots gain by help of their own, for the allocator `by_coverage`: 0.097 U + 0.903 R, and 10,000 C.
 
-    U and R count as 0 below their thresholds. The published code has 0.151 and 0.198 for its own ensemble and critic; here
-    they are those of the environment, as for C.U.R.
+    U and R count as 0 below `asa_uncertainty` and `asa_risk`; their defaults are those of the published code, which were
+    tuned to its own ensemble and critic. In the initial period robots in violation score 0, and nobody helps them; the
+    original subtracts 10,000 there, but may still pick such a robot for the sake of its neighbours.
 
-    Reference: Adaptive submodular allocation (ASA), published code of Fleet-Supervisor-Allocation.
+    Reference: Akcin et al., Fleet supervisor allocation: a submodular maximization approach (ASA), 2024, and its published
+    code.
     """
 
     def score(signals, key):
         del key
-        doubt = above(known(signals.uncertainty), config.uncertainty_threshold)
-        risk = above(known(signals.risk), config.risk_threshold)
-        late = signals.timestep >= config.initial_period
-        return UNCERTAINTY * doubt + RISK * risk + VIOLATION * (signals.violation & late).astype(jnp.float32)
+        early = signals.timestep < config.initial_period
+        own = informativeness(config, signals) + VIOLATION * signals.violation.astype(jnp.float32)
+        return jnp.where(signals.violation & early, 0.0, own)
 
     return stateless(score)
+
+
+def informativeness(config, signals: Signals) -> jax.Array:
+    """Return f32[N], 0.097 U + 0.903 R, each 0 below its threshold: what help for a robot like it is worth."""
+    doubt = above(known(signals.uncertainty), config.parameters["asa_uncertainty"])
+    risk = above(known(signals.risk), config.parameters["asa_risk"])
+    return UNCERTAINTY * doubt + RISK * risk
 
 
 def similarity(obs: jax.Array) -> jax.Array:
     """Return f32[N, N], 1 / (1 + 4.89 d) for the root mean squared distance d of observations f32[N, O].
 
-    Observations are scaled by the fleet's own mean and deviation at this timestep.
+    Observations are scaled by the fleet's own mean and deviation at this timestep, so that no unit counts more than another.
     """
     deviation = jnp.std(obs, axis=0)
     scaled = known((obs - jnp.mean(obs, axis=0)) / jnp.where(deviation > 1e-6, deviation, 1.0))
@@ -50,8 +59,11 @@ def similarity(obs: jax.Array) -> jax.Array:
 def by_coverage(config) -> Allocator:
     """Return the allocator that picks robots one by one, each time the one that covers most of what is not covered yet.
 
-    Robot j covers i by M_ij = similarity_ij weight_i. A set covers sum_i max_j M_ij; those who are bound to a human are in
-    it already. A pick's gain counts times the quality of the link to it, and picking stops when it is below `asa_threshold`.
+    Robot j covers i by M_ij = similarity_ij informativeness_i, and itself by M_jj, its score: help ends the violation of that
+    robot, not those of its neighbours. A set covers sum_i max_j M_ij; those who are bound to a human are in it already. A
+    pick's gain counts times the quality of the link to it, and picking stops when it is below `asa_threshold`. The original
+    learns whether the link to one pick works before it makes the next; here links are drawn afterwards, and a pick counts as
+    covered.
     """
 
     def cover(
@@ -64,9 +76,11 @@ def by_coverage(config) -> Allocator:
     ) -> HumanState:
         assert signals is not None
         n = score.shape[0]
-        weight = jnp.where(score > 0, score, 0.0)  # a NaN is not > 0
-        covers = similarity(signals.obs.astype(jnp.float32)) * weight[:, None]
-        bound = jnp.zeros(n, bool).at[jnp.where(is_bound(humans, min_time), humans.robot, n)].set(True, mode="drop")
+        own = jnp.where(score > 0, score, 0.0)  # a NaN is not > 0
+        shared = similarity(signals.obs.astype(jnp.float32)) * informativeness(config, signals)[:, None]
+        covers = jnp.where(jnp.eye(n, dtype=bool), own, shared)
+        stays = is_bound(humans, min_time) if available is None else available & is_bound(humans, min_time)
+        bound = sharding.put(jnp.zeros(n, bool), jnp.where(stays, humans.robot, n), True)
         covered = jnp.max(jnp.where(bound[None], covers, 0.0), axis=1)
         link = jnp.ones(n, jnp.float32) if signals.link is None else signals.link
 
@@ -82,7 +96,7 @@ def by_coverage(config) -> Allocator:
 
         number = min(humans.robot.shape[0], n)
         turns = jnp.arange(number, 0, -1).astype(jnp.float32)
-        start = (covered, jnp.zeros(n, jnp.float32), (weight > 0) & ~bound)
+        start = (covered, jnp.zeros(n, jnp.float32), (own > 0) & ~bound)
         order = jax.lax.scan(pick, start, turns)[0][1]
         return allocate(order, humans, min_time, key, available)
 

@@ -24,7 +24,9 @@ def safe_dagger(config) -> Priority:
 
     P is the `"discrepancy"` classifier's.
 
-    Reference: Zhang and Cho, SafeDAgger, 2017, with its tau of 0.0025; reimplemented from the text.
+    The default tau, 0.0025, is fleetjax's.
+
+    Reference: Zhang and Cho, SafeDAgger, 2017; reimplemented from the text.
     """
     threshold = config.parameters["safe_threshold"]
     return stateless(lambda signals, key: gated(signals, above(known(signals.estimates["discrepancy"]), threshold)))
@@ -34,7 +36,8 @@ def lazy_dagger(config) -> Priority:
     """Ask if P(d > tau) >= `lazy_threshold`, as `safe_dagger`; hand back if the human's d < `lazy_handback` tau.
 
     Two thresholds make fewer and longer interventions. The original's tau, 0.008 of the sum of the actions' squared ranges, is
-    0.032 per dimension of [-1, 1]. Its optional noise on the human's action is left to models of people.
+    0.032 per dimension of [-1, 1]. The original may also execute the human's action with noise, and records the action without
+    it. That option is not here: with `action_noise`, which models people, the noisy action is recorded.
 
     Reference: Hoque et al., LazyDAgger, 2021 (Algorithm 1, and the published code: the hand-back's factor is 0.25).
     """

@@ -32,8 +32,8 @@ def helped(signals: Signals) -> jax.Array:
 
 
 def teleoperated(signals: Signals) -> jax.Array:
-    """Return bool[N], the robots that a human teleoperated at the last timestep."""
-    return signals.helped & ~signals.violation & (signals.correction > 0)
+    """Return bool[N], the robots on which a human acted at the last timestep, unless they are now in violation."""
+    return signals.given & ~signals.violation
 
 
 def known(values: jax.Array) -> jax.Array:

@@ -40,19 +40,18 @@ class Past(NamedTuple):
     Attributes:
         doubt: Histogram of uncertainties.
         chance: Histogram of chances of success.
-        corrections: f32[2], number and sum of the corrections so far; older ones count less.
     """
 
     doubt: Histogram
     chance: Histogram
-    corrections: jax.Array
 
 
 def thrifty_quantile(config) -> Priority:
     """Ask if U > q_U(1 - a) or G < q_G(a), with a = `thrifty_rate`; hand back if |a_r - a_h|^2 < its mean and G > q_G(1/2).
 
-    q are running quantiles over robots that move on their own, and the mean is that of all corrections. They forget within
-    `thrifty_memory` timesteps, where the original refits them after each episode. G is the goal critic's chance of success;
+    q are running quantiles over robots that move on their own. They forget within `thrifty_memory` timesteps, where the
+    original refits them after each episode. The mean is that in training: what the policy now does, on a batch of all human
+    data; see the estimator `"mean_discrepancy"`. G is the goal critic's chance of success;
     where the environment has no goals, 1 - R. Robots that ask are ordered by max(U / q_U, q_G / G).
 
     Reference: Hoque et al., ThriftyDAgger, 2021 (Section 4, and the published code: a = 0.01). Its start values 0.48 and
@@ -61,24 +60,18 @@ def thrifty_quantile(config) -> Priority:
     rate, memory = config.parameters["thrifty_rate"], config.parameters["thrifty_memory"]
 
     def init():
-        return Past(empty(), empty(), jnp.zeros(2))
+        return Past(empty(), empty())
 
     def score(signals, past, key):
         del key
-        has_goal = "goal" in (signals.estimates or {})
+        has_goal = "goal" in signals.estimates
         doubt, chance = known(signals.uncertainty), known(signals.goal if has_goal else 1.0 - signals.risk)
         alone, taught = on_their_own(signals), teleoperated(signals)
-        corrections = jnp.stack([jnp.sum(taught).astype(jnp.float32), jnp.sum(jnp.where(taught, signals.correction, 0.0))])
-        past = Past(
-            add(past.doubt, doubt, alone, memory),
-            add(past.chance, chance, alone, memory),
-            past.corrections * jnp.exp(-1.0 / memory) + corrections,
-        )
+        past = Past(add(past.doubt, doubt, alone, memory), add(past.chance, chance, alone, memory))
         most, least = quantile(past.doubt, 1.0 - rate), quantile(past.chance, rate)
         asks = (doubt > most) | (chance < least)
         urgency = jnp.maximum(doubt / jnp.maximum(most, 1e-6), least / jnp.maximum(chance, 1e-6))
-        number, total = past.corrections
-        agrees = signals.correction * number < total
+        agrees = signals.correction < signals.estimates["mean_discrepancy"]
         keeps = taught & ~(agrees & (chance > quantile(past.chance, 0.5)))
         return gated(signals, jnp.where(asks, urgency, 0.0), keeps), past
 
@@ -88,6 +81,9 @@ def thrifty_quantile(config) -> Priority:
 QUANTILES: dict[str, Algorithm] = {
     "quantile_ensemble": Algorithm(quantile_ensemble, parameters=PARAMETERS["quantile_ensemble"]),
     "thrifty_quantile": Algorithm(
-        thrifty_quantile, estimators=("safety", "goal"), optional=("goal",), parameters=PARAMETERS["thrifty_quantile"]
+        thrifty_quantile,
+        estimators=("safety", "goal", "mean_discrepancy"),
+        optional=("goal",),
+        parameters=PARAMETERS["thrifty_quantile"],
     ),
 }

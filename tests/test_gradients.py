@@ -401,5 +401,16 @@ def test_bad_requests_are_refused_before_anything_is_computed(config, monkeypatc
 
 @pytest.mark.slow
 def test_mjx_has_only_forward_derivatives():
-    config = fleetjax.make_config("humanoid", "weighted", **{**TINY, "backend": "mjx"})
+    tiny = {**TINY, "num_robots": 2, "num_humans": 1, "num_steps": 3, "backend": "mjx", "learning_rate": 0.01}
+    config = fleetjax.make_config("humanoid", "weighted", **tiny)
     assert "use method = 'forward' or 'smoothed'" in refused(config, method="relaxed")
+
+    def reward(metrics, config):
+        return jnp.sum(metrics.reward)
+
+    found = compiled(partial(fleetjax.sensitivity, fields="learning_rate", objective=reward, method="forward"))(config, KEYS[0])
+    state = compiled(fleetjax.prepare)(config, KEYS[0])
+    run = compiled(lambda rate: reward(fleetjax.run(config.replace(learning_rate=rate), KEYS[0], state).metrics, config))
+    difference = (run(jnp.float32(0.0101)) - run(jnp.float32(0.0099))) / 0.0002
+    np.testing.assert_allclose(found.gradient["learning_rate"], difference, rtol=0.1)
+    assert difference != 0

@@ -89,7 +89,9 @@ class Fields:
     min_teleop_time: int = _traced(5, "shortest teleoperation t_T", "timesteps", low=1)
     hard_reset_time: int = _traced(5, "duration of a hard reset t_R", "timesteps", low=1)
     initial_period: int = _traced(
-        0, "first timesteps t_I in which cur and other orders with C send no human to robots in violation"
+        0,
+        "first t_I timesteps, in which cur, other orders with C, weighted and asa send no human to robots in violation",
+        "timesteps",
     )
     success_return: float = _traced(
         0.0, "return above which an episode of full length succeeds, where the environment judges by returns", low=None
@@ -99,7 +101,7 @@ class Fields:
     )
     risk_threshold: float = _traced(0.5, "robots below this risk count as safe", high=1)
     temperature: float = _traced(
-        0.1, "how soft the soft allocation is: the width of its sigmoids, in units of scores, and of tolerances of success"
+        0.1, "softness of the soft allocation: width of its sigmoids, in units of scores (successes: of the success tolerance)"
     )
     learning_rate: float = _traced(3e-4, "Adam's learning rate, policy and critics")
     normalize_observations: bool = _traced(
@@ -125,8 +127,8 @@ class Fields:
     fatigue: float = _of_humans(0.0, "growth of takeover time and noise for one who is always busy, as a share")
     absence: float = _of_humans(0.0, "share of the time in which they are away", high=0.99)
     absence_time: float = _of_humans(100.0, "mean time for which they are away", "timesteps", low=1)
-    link_failure_rate: float = _traced(0.01, "gilbert_elliott: chance that one that works fails, per timestep", high=1)
-    link_repair_rate: float = _traced(0.1, "gilbert_elliott: chance that one that failed is repaired, per timestep", high=1)
+    link_failure_rate: float = _traced(0.01, "gilbert_elliott: chance per timestep that a working link fails", high=1)
+    link_repair_rate: float = _traced(0.1, "gilbert_elliott: chance per timestep that a failed link is repaired", high=1)
 
 
 FIELDS: dict[str, Field] = {f.name: f.metadata["field"] for f in dataclasses.fields(Fields)}
@@ -150,11 +152,9 @@ OFFLINE = (
 # The orders of C, U and R, such as C.U.R.
 ORDERS = tuple("".join(letters) for size in (3, 2, 1) for letters in itertools.permutations("cur", size))
 ORDERS_WITH_C = tuple(letters for letters in ORDERS if "c" in letters)
-_IDLE = Field(
-    "in the initial period, humans whom nobody else needs teleoperate random robots", kind=bool, high=None, default=False
-)
+_IDLE = Field("in the initial period, free humans teleoperate random robots", kind=bool, high=None, default=False)
 
-_TAU = Field("mean squared difference of actions above which they are a discrepancy", default=0.0025)
+_TAU = Field("mean squared difference of actions that counts as a discrepancy (lazy_dagger: 0.032)", default=0.0025)
 
 # The parameters that an algorithm has besides, by its name. `register_algorithm` adds those of others.
 PARAMETERS: dict[str, Mapping[str, Field]] = {
@@ -170,13 +170,13 @@ PARAMETERS: dict[str, Mapping[str, Field]] = {
         "goal_weight": Field("weight of the chance not to reach the goal; needs an environment with goals", default=0.0),
     },
     "quantile_ensemble": {
-        "quantile_rate": Field("share of robots at each timestep that may ask", high=1, default=0.01),
+        "quantile_rate": Field("target share of robots that ask, over time", high=1, default=0.01),
         "quantile_memory": Field("time within which quantiles forget", "timesteps", low=1, default=1000.0),
         "quantile_calibration": Field("time from which the quantile stays as it is; 0 = never", "timesteps", default=0.0),
     },
     "thrifty_quantile": {
-        "thrifty_rate": Field("share of robots at each timestep that may ask, by each of two criteria", high=1, default=0.01),
-        "thrifty_memory": Field("time within which quantiles and means forget", "timesteps", low=1, default=1000.0),
+        "thrifty_rate": Field("target share of robots that ask, over time, by each of two criteria", high=1, default=0.01),
+        "thrifty_memory": Field("time within which quantiles forget", "timesteps", low=1, default=1000.0),
     },
     "safe_dagger": {
         "safe_threshold": Field("chance of a discrepancy below which no robot asks", high=1, default=0.5),
@@ -205,8 +205,8 @@ PARAMETERS: dict[str, Mapping[str, Field]] = {
         "conformal_rate": Field("share of humans' actions that may lie outside the interval", high=1, default=0.1),
         "conformal_gain": Field("how fast the interval adapts", default=0.05),
     },
-    "aim": {"aim_rate": Field("share of robots at each timestep that may ask", high=1, default=0.05)},
-    "iifl": {"iifl_rate": Field("share of robots at each timestep that may ask", high=1, default=0.001)},
+    "aim": {"aim_rate": Field("target share of robots that ask, over time", high=1, default=0.05)},
+    "iifl": {"iifl_rate": Field("target share of robots that ask, over time", high=1, default=0.001)},
     "round_robin": {
         "round_robin_threshold": Field("time without help up to which no robot is served", "timesteps", default=100.0),
     },

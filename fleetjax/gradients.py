@@ -31,7 +31,7 @@ from fleetjax.registry import unknown
 METHODS = ("smoothed", "relaxed", "forward")
 WIDTH = 0.1  # deviation of perturbations, in units of a field's value
 STEPS, _NOISE = 2**32 - 2, 2**32 - 1  # folded into a run's key for tuning and for noise; `keys.key_at` folds in timesteps
-_SMALLEST = 1e-6  # to which positive fields are shifted at most: some are divided by
+_SMALLEST = 1e-6  # of a shifted field whose lower bound is 0, since some are divided by
 Objective = Callable[[Metrics, Config], jax.Array]
 Values = dict[str, jax.Array]
 
@@ -342,7 +342,7 @@ def _check_derivatives(config: Config, env: Env, method: str) -> None:
 
 
 def reverse_bytes(config: Config, env: Env) -> int:
-    """Return about how many bytes reverse mode through a run keeps: the state of each block, and of one block all steps."""
+    """Return about how many bytes reverse mode through a run keeps: the state before each block, and all steps of one block."""
     size = math.isqrt(config.num_steps)
     state = checks.state_shapes(config, env)
 
@@ -354,7 +354,7 @@ def reverse_bytes(config: Config, env: Env) -> int:
 
 
 def _warn_of_zeros(found: Sensitivity, known: Sequence[str], *, hard: bool) -> None:
-    """Warn of fields whose derivative is exactly 0, where numbers are known, but for the `known` ones."""
+    """Warn of fields, other than `known`, whose derivative is exactly 0; under jit numbers are not known."""
     why = ": in a hard fleet, thresholds, ranks and counts have none; try method = 'smoothed'" if hard else ""
     for name, slope in found.gradient.items():
         if name not in known and not isinstance(slope, Tracer) and slope == 0:

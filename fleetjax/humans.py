@@ -25,8 +25,8 @@ class HumanModel(NamedTuple):
         available: `(aux, key) -> bool[M]`, the humans who are there.
         act: `(aux, Plan, action f32[N, A], key) -> (aux, action f32[N, A], given bool[N])`: what humans really do, of what the
             supervisor would do, and on which robots. On the others their own policy acts, and nothing is recorded.
-        unready: `aux -> i32[M]`, for how many timesteps of the ongoing intervention each human was not ready to act; these do
-            not count for t_T, the shortest teleoperation. None = for none.
+        unready: `aux -> i32[M]`, timesteps of the current intervention that each human spent taking over; they do not count
+            towards t_T, the shortest teleoperation. None = 0.
     """
 
     init: Callable[[Any, jax.Array], Any]
@@ -40,8 +40,8 @@ class People(NamedTuple):
 
     Attributes:
         robot: i32[M] whom they helped at the last timestep, -1 = nobody.
-        wait: i32[M] timesteps until they act on it, those of the last one included.
-        unready: i32[M] timesteps of the ongoing intervention in which they waited so.
+        wait: i32[M] timesteps until they act on it, counting the last timestep.
+        unready: i32[M] timesteps of the current intervention that they spent waiting.
         busy: f32[M] share of the last timesteps in which they were busy, in [0, 1].
         away: bool[M].
         past: f32[N, LONGEST_DELAY, A] what the supervisor would have done on each robot, the latest first.
@@ -75,10 +75,9 @@ def takeover_times(mean: jax.Array, spread: jax.Array, key: jax.Array) -> jax.Ar
 def make_imperfect(config: Any, spec: EnvSpec) -> HumanModel:
     """Build the model whose parameters are `action_noise` to `absence_time` of `Config`.
 
-    - Takeover: a human who comes to a robot acts on it only after a takeover time, and `switching_lag` more if it comes from
-      another robot. The sum becomes a whole number of timesteps by chance, so that its mean is kept. Meanwhile the robot's
-      policy acts; the human's time counts, but not for t_T: it stays until it could act for t_T timesteps. Hard resets take t_R
-      as ever.
+    - Takeover: a human acts on a new robot only after a takeover time, and `switching_lag` more after another robot. The sum is
+      rounded up or down by chance, so that its mean is kept. Meanwhile the robot's policy acts, and the human's time counts.
+      The shortest teleoperation t_T starts after the takeover. Hard resets take t_R, as ever.
     - Delay: the action is the one for what the robot was in `action_delay` timesteps ago, but not before its last reset.
     - Skill: normal noise on continuous actions, and a random action in its place with `mistake_rate`.
     - Fatigue: takeover time and noise are multiplied by 1 + `fatigue` b, for the share b of recent time in which the human was

@@ -41,7 +41,7 @@ def test_mjx_agrees_with_native(name):
 
 @each_robot
 def test_warp_agrees_with_native(name):
-    pytest.importorskip("warp", reason='needs pip install "fleetjax[cuda12,warp]"')
+    pytest.importorskip("warp", reason='needs pip install ".[cuda12,warp]"')
     assert_agree_with_native(name, "warp")
 
 

@@ -696,7 +696,7 @@ def test_kills_of_workers_and_of_all_lose_nothing(tmp_path, spawn, whole_long):
 def test_a_launcher_needs_submitit(capsys, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "submitit", None)
     said = refused(capsys, "sweep", "navigation", "--launcher", "local", "--output", tmp_path / "out")
-    assert 'needs submitit; install it: pip install "fleetjax[cluster]"' in said
+    assert 'needs submitit; install it: pip install ".[cluster]"' in said
     assert not (tmp_path / "out").exists()
 
 

@@ -31,10 +31,10 @@ class Fit(NamedTuple):
     """The parameters of `Config` for people like those of a session; times are in timesteps.
 
     Attributes:
-        takeover_time: mean time to the first action, for those who were free before.
+        takeover_time: mean time to the first action, for people who were free before; for all if there are too few of those.
         takeover_spread: its standard deviation, as a share of the mean.
         switching_lag: further time for those who come from another robot.
-        absence: share of the time in which people who had come were away.
+        absence: share of the time for which people were away, from their arrival to their last timestep.
         absence_time: mean time for which they were away; the default of `Config` if they never were.
     """
 
@@ -69,7 +69,7 @@ def takeovers(rows: np.ndarray, seat: int) -> list[Takeover]:
 
 
 def absences(rows: np.ndarray, seat: int) -> tuple[int, list[int]]:
-    """Return the timesteps from a seat's first person to its last, and how long each time without one between them was."""
+    """Return the timesteps from a seat's first person to its last, and the lengths of the gaps in between."""
     there = np.flatnonzero(rows["seat"][:, seat] == PERSON)
     if not there.size:
         return 0, []
@@ -80,8 +80,8 @@ def absences(rows: np.ndarray, seat: int) -> tuple[int, list[int]]:
 def fit(rows: np.ndarray, seats: Iterable[int], *, absence_time: float) -> Fit:
     """Return the model that fits the people in some seats.
 
-    Times are lognormal, as in `fleetjax.humans.make_imperfect`. They are known to the timestep, and help that ended before
-    the first action counts as a time that is longer.
+    Times are lognormal, as in `fleetjax.humans.make_imperfect`. They are known to the timestep. If help ended before the
+    first action, the takeover would have taken longer.
 
     Args:
         rows: of a record, see `record.row_type`.
@@ -89,7 +89,7 @@ def fit(rows: np.ndarray, seats: Iterable[int], *, absence_time: float) -> Fit:
         absence_time: of people who were never away.
 
     Raises:
-        ValueError: if people acted first fewer than `FEWEST` times.
+        ValueError: if there are fewer than `FEWEST` first actions.
     """
     seats = list(seats)
     times = [one for seat in seats for one in takeovers(rows, seat)]

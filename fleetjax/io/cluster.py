@@ -33,7 +33,7 @@ def check(launcher: study.Launcher | None) -> None:
     try:
         submitit = _submitit()
     except ImportError:
-        raise ValueError(f'launcher = {launcher.kind!r} needs submitit; install it: pip install "fleetjax[cluster]"') from None
+        raise ValueError(f'launcher = {launcher.kind!r} needs submitit; install it: pip install ".[cluster]"') from None
     if launcher.kind == "slurm" and submitit.SlurmExecutor.affinity() < 0:
         raise ValueError("launcher = 'slurm' needs SLURM, and this machine has no srun; run this on the cluster, or omit it")
 

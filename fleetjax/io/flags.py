@@ -25,14 +25,14 @@ Interactive fleet learning: N robots, M humans. Who should get help, and what do
   fleetjax run humanoid                 the paper's main experiment, C.U.R. with 100 humanoids
   fleetjax run humanoid --help          every parameter, with its meaning, unit and default
   fleetjax sweep navigation --seeds 5 --output DIR   many runs, in parallel
-  fleetjax calibrate navigation --human-time 10000   the threshold at which C.U.R. spends so much
+  fleetjax calibrate navigation --human-time 10000   the threshold at which C.U.R. spends 10,000 human timesteps
   fleetjax plot runs/humanoid-*         runs in one figure; seeds become a mean and a band
   fleetjax compare runs --against cur   tables of runs: means, intervals, differences
   fleetjax evaluate RUN                 the trained policy on its own; nobody teleoperates
   fleetjax console navigation --humans 2   real people supervise, in their browsers"""
 _RUN_ABOUT = """\
-Clone demonstrations, then run the fleet while it learns from those who help it. Prints a table at the end and writes a run
-folder: config.json, metrics.csv (one row per timestep), figure.png, policy.msgpack and the last two checkpoints."""
+Pre-train the policy on demonstrations, then run the fleet while it learns from its humans. Prints a table at the end and writes
+a run folder: config.json, metrics.csv (one row per timestep), figure.png, policy.msgpack and the last two checkpoints."""
 _SWEEP_ABOUT = """\
 Run every combination of several values in parallel, each in a run folder of its own below DIR. The same command resumes a sweep
 that was stopped, and a larger one extends it.
@@ -42,11 +42,11 @@ algorithm is given to that algorithm alone. A FILE holds the same names with lis
 _CALIBRATE_ABOUT = """\
 Find the value of a parameter at which an algorithm spends a given human time, by a few runs with the first seed, and confirm it
 with the others. Thresholds do not carry over between robots, policies or sizes of a run. The runs are kept below DIR, so the
-same command resumes, and a finished one answers at once."""
+same command resumes; repeated when it is finished, it prints the result at once."""
 _RUN_NOTE = """\
 Some algorithms change defaults: expert has as many humans as robots; constraint gets as many extra demonstrations as C.U.R.
-uses human timesteps (none where the environment does not ship); constraint_trained also takes as many gradient steps before
-the start as the others take in total."""
+uses human timesteps (none for environments that are not part of fleetjax); constraint_trained also takes as many gradient steps
+before the start as the others take in total."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -84,7 +84,7 @@ _RENDER_ABOUT = """Draw robots as an animation, a grid of tiles. Teleoperated ro
 expert: the supervisor acts on every robot. robot: the trained policy of a run acts, and nobody teleoperates. mixed: the
 pre-trained fleet runs, and its humans help."""
 _HUMANS_ABOUT = """Print how long people took to act on robots in a console session, how much longer if they came from another
-robot, and how often they were away: as a table by seat, and as flags of `fleetjax run` for simulated humans like them. Noise,
+robot, and how often they were away: a table by seat, and the flags of `fleetjax run` that fit all of them together. Noise,
 mistakes and delays are not fitted."""
 _EVALUATE_ABOUT = """Run the trained policy of a run without teleoperation: humans only reset robots in violation, and nothing
 is learnt. Prints a table and writes RUN/evaluation.json."""
@@ -148,7 +148,9 @@ def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser
     render.add_argument("--policy", choices=policies, help="who acts [default: robot for a run, expert for an environment]")
     render.add_argument("--num-shown", metavar="N", type=integer, default=4, help="robots in the picture [default: 4]")
     render.add_argument("--num-steps", metavar="N", type=integer, default=200, help="timesteps to draw [default: 200]")
-    render.add_argument("--skip", metavar="N", type=integer, default=0, help="timesteps to run before them [default: 0]")
+    render.add_argument(
+        "--skip", metavar="N", type=integer, default=0, help="timesteps to run before the first picture [default: 0]"
+    )
     render.add_argument("--every", metavar="N", type=integer, default=2, help="timesteps per picture [default: 2]")
     render.add_argument(
         "--width", metavar="N", type=integer, default=320, help="width of a robot's tile (pixels) [default: 320]"
@@ -287,7 +289,9 @@ def _add_calibrate(commands: Any, environment: str | None) -> None:
     calibrate.add_argument("--seeds", metavar="N", type=integer, default=3, help="seeds in all [default: 3]")
     near = "relative difference that is near enough [default: 0.05]"
     calibrate.add_argument("--tolerance", metavar="X", type=number, default=0.05, help=near)
-    calibrate.add_argument("--most", metavar="N", type=integer, default=10, help="runs of the search at most [default: 10]")
+    calibrate.add_argument(
+        "--most", metavar="N", type=integer, default=10, help="largest number of runs in the search [default: 10]"
+    )
     calibrate.add_argument("--output", metavar="DIR", type=Path, help="folder of its runs [default: below runs/]")
     every = "timesteps between the checkpoints of a run; 0 = none [default: 1000]"
     calibrate.add_argument("--checkpoint-every", metavar="N", type=integer, default=1000, help=every)
@@ -300,7 +304,7 @@ def _add_console(commands: Any, environment: str | None) -> None:
         "console", help="let people supervise a fleet in their browsers", usage=usage, description=_CONSOLE_ABOUT
     )
     console.add_argument("environment", metavar="ENV", nargs="?", default=argparse.SUPPRESS, help="environment with pictures")
-    console.add_argument("--host", default="127.0.0.1", help="address to listen on; any but this machine's own needs --token")
+    console.add_argument("--host", default="127.0.0.1", help="address to listen on; any but localhost needs --token")
     console.add_argument("--port", metavar="N", type=integer, default=PORT, help=f"port; 0 = any free one [default: {PORT}]")
     console.add_argument("--token", help="token that pages need as ?token=TOKEN: 8 to 128 letters, digits, or . _ ~ -")
     console.add_argument("--interval", metavar="X", type=number, help="seconds per timestep [default: the control step]")

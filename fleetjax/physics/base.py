@@ -40,7 +40,7 @@ def check_backend(backend: str) -> None:
     missing += [] if importlib.util.find_spec("warp") else ["warp-lang is not installed"]
     if missing:
         raise ValueError(
-            f"backend = 'warp' needs an NVIDIA GPU and pip install \"fleetjax[cuda12,warp]\" ({' and '.join(missing)}); "
+            f"backend = 'warp' needs an NVIDIA GPU and pip install \".[cuda12,warp]\" ({' and '.join(missing)}); "
             "or choose backend = 'mjx'"
         )
 

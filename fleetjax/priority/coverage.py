@@ -17,7 +17,7 @@ NEARNESS = 4.89  # how fast similarity falls with distance
 
 
 def asa(config) -> Priority:
-    """What robots gain by help of their own, for the allocator `by_coverage`: 0.097 U + 0.903 R, and 10,000 C.
+    """Score what each robot gains from being helped itself, for the allocator `by_coverage`: 0.097 U + 0.903 R + 10,000 C.
 
     U and R count as 0 below `asa_uncertainty` and `asa_risk`; their defaults are those of the published code, which were
     tuned to its own ensemble and critic. In the initial period robots in violation score 0, and nobody helps them; the
@@ -37,7 +37,7 @@ def asa(config) -> Priority:
 
 
 def informativeness(config, signals: Signals) -> jax.Array:
-    """Return f32[N], 0.097 U + 0.903 R, each 0 below its threshold: what help for a robot like it is worth."""
+    """Return f32[N], 0.097 U + 0.903 R, each 0 below its threshold: what help for a similar robot is worth."""
     doubt = above(known(signals.uncertainty), config.parameters["asa_uncertainty"])
     risk = above(known(signals.risk), config.parameters["asa_risk"])
     return UNCERTAINTY * doubt + RISK * risk
@@ -57,10 +57,10 @@ def similarity(obs: jax.Array) -> jax.Array:
 
 
 def by_coverage(config) -> Allocator:
-    """Return the allocator that picks robots one by one, each time the one that covers most of what is not covered yet.
+    """Return the allocator that picks robots one by one, each time the one that adds most to what the picked robots cover.
 
     Robot j covers i by M_ij = similarity_ij informativeness_i, and itself by M_jj, its score: help ends the violation of that
-    robot, not those of its neighbours. A set covers sum_i max_j M_ij; those who are bound to a human are in it already. A
+    robot, not those of its neighbours. A set covers sum_i max_j M_ij. Robots that must keep their human count as picked. A
     pick's gain counts times the quality of the link to it, and picking stops when it is below `asa_threshold`. The original
     learns whether the link to one pick works before it makes the next; here links are drawn afterwards, and a pick counts as
     covered.

@@ -41,11 +41,11 @@ def conformal(config) -> Priority:
     """Ask if the interval of the human's action is wider than `conformal_threshold`: 2 q s, with the ensemble's spread s.
 
     Only labels move q. After a timestep in which humans taught robots, q is multiplied by exp(`conformal_gain` (e -
-    `conformal_rate`)), where e is the share of these robots whose residual was beyond q s. The weight 1 / p of a label, for
-    its probability p, is the same for all of them: so e is a mean over them.
+    `conformal_rate`)), where e is the share of these robots whose residual was beyond q s. All labels have the same
+    probability p, so their weights 1 / p cancel, and e is a plain mean.
 
     Reference: ConformalDAgger with intermittent quantile tracking, 2024 (arXiv 2410.08852); reimplemented from the text. The
-    original has one robot; the spread tells those of a fleet apart, and steps are in proportion to q.
+    original has one robot. Here the spread s differs between robots, and q changes by a factor.
     """
     own = config.parameters
 
@@ -81,8 +81,8 @@ def aim(config) -> Priority:
 def iifl(config) -> Priority:
     """Ask if the Jeffreys divergence of two energy models is above its running quantile at level 1 - `iifl_rate`.
 
-    Here only this uncertainty comes from energy models: the robots go on to act by the regression ensemble. See the
-    estimator `"divergence"`.
+    Only this uncertainty comes from energy models (the estimator `"divergence"`); the robots still act by the regression
+    ensemble.
 
     Reference: Datta et al., IIFL, 2023 (Section 4, and the published code: the 99.9th percentile of the last 1 000 steps).
     """

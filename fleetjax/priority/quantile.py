@@ -50,9 +50,9 @@ def thrifty_quantile(config) -> Priority:
     """Ask if U > q_U(1 - a) or G < q_G(a), with a = `thrifty_rate`; hand back if |a_r - a_h|^2 < its mean and G > q_G(1/2).
 
     q are running quantiles over robots that move on their own. They forget within `thrifty_memory` timesteps, where the
-    original refits them after each episode. The mean is that in training: what the policy now does, on a batch of all human
-    data; see the estimator `"mean_discrepancy"`. G is the goal critic's chance of success;
-    where the environment has no goals, 1 - R. Robots that ask are ordered by max(U / q_U, q_G / G).
+    original refits them after each episode. The mean is the current policy's mean squared difference from the
+    human actions, over a batch of all human data (the estimator `"mean_discrepancy"`). G is the goal critic's chance of
+    success; where the environment has no goals, 1 - R. Robots that ask are ordered by max(U / q_U, q_G / G).
 
     Reference: Hoque et al., ThriftyDAgger, 2021 (Section 4, and the published code: a = 0.01). Its start values 0.48 and
     0.495 are not used: the first timestep gives the first quantiles.

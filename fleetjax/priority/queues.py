@@ -8,9 +8,9 @@ from fleetjax.priority.gates import helped
 
 
 def round_robin(config) -> Priority:
-    """The robot first that has been without help longest; none within `round_robin_threshold` timesteps of its last help.
+    """Help the robot that has been without help longest, but none within `round_robin_threshold` timesteps of its last help.
 
-    The first time, robots come in the order of their indices.
+    At the start, robot i counts as having waited N - i timesteps.
     """
     threshold = config.parameters["round_robin_threshold"]
 

@@ -138,12 +138,13 @@ def main() -> None:
     scripts.add_names(parser, "parts", PARTS)
     parser.add_argument("--studies", type=Path, default=HERE / "studies", help="folder of the parts' files")
     parser.add_argument("--seeds", type=int, help="number of seeds, instead of the file's")
-    parser.add_argument("--workers", type=int, help="processes [default: one for each core]")
+    parser.add_argument("--workers", type=int, help="processes [default: one for each GPU; without GPUs, one for each core]")
     parser.add_argument("--output", type=Path, default=Path("runs/paper"), help="folder for the run folders")
     parser.add_argument("--results", type=Path, default=HERE / "results", help="folder for rows, tables and figures")
     parser.add_argument("--rows-only", action="store_true", help="no runs; only tables and figures")
     args = parser.parse_args()
     args.results.mkdir(parents=True, exist_ok=True)
+    sweep.leave_gpus_to_workers()  # so policies are evaluated on the CPU
     for part in [Part(name, args) for name in args.parts]:
         if not args.rows_only:
             part.evaluate(Part(TRAINED, args)) if part.name == "policies" else part.run()

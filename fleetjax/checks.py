@@ -57,13 +57,13 @@ def check_run(config: Config, env: Env | None = None, state: FleetState | None =
     return env
 
 
-def check_plan(config: Config, env: Env | None = None, state: FleetState | None = None) -> Env:
-    """Check as `check_run` does, but for the backend: another process, which may have a GPU, computes the run."""
+def check_plan(config: Config, env: Env | None = None, state: FleetState | None = None, *, copies: int = 1) -> Env:
+    """Check as `check_run`, but not the backend: another process, which may have a GPU, computes `copies` of it at once."""
     validate(config, env)
     check_mesh(config)
     env = env or envs.make(config.environment, config.backend)
     shapes = state_shapes(config, env)
-    check_memory(config, shapes)
+    check_memory(config, shapes, copies)
     if state is not None:
         check_state(config, env, state, shapes)
     return env
@@ -104,12 +104,13 @@ def robot_bytes(config: Config, state: FleetState) -> int:
     return 3 * in_state + 8 * config.ensemble_size * (max(config.hidden_sizes) + action_size)
 
 
-def check_memory(config: Config, state: FleetState) -> None:
+def check_memory(config: Config, state: FleetState, copies: int = 1) -> None:
     """Check that the arrays that a run cannot do without fit the memory.
 
     Args:
         config: configuration.
         state: shapes of the fleet's state.
+        copies: runs that are computed side by side.
 
     Raises:
         ValueError: if they do not; the message has the estimate, the memory there is, and the field to reduce.
@@ -126,12 +127,13 @@ def check_memory(config: Config, state: FleetState) -> None:
     divided, everywhere = sharding.shares()
     for name in parts:
         parts[name] = math.ceil(parts[name] * (divided if name in ("num_robots", "critic_capacity") else everywhere))
-    needed, limit = sum(parts.values()), memory()
+    needed, limit = copies * sum(parts.values()), memory()
+    who = "the run needs" if copies == 1 else f"{copies} runs side by side need"
     if needed > limit:
         largest = max(parts, key=lambda name: parts[name])
         raise ValueError(
-            f"{largest} = {getattr(config, largest)} is too large: the run needs at least {needed / _GIB:,.2f} GiB of memory "
-            f"({parts[largest] / _GIB:,.2f} GiB for this field), but only {limit / _GIB:,.2f} GiB are available"
+            f"{largest} = {getattr(config, largest)} is too large: {who} at least {needed / _GIB:,.2f} GiB of memory "
+            f"({copies * parts[largest] / _GIB:,.2f} GiB for this field), but only {limit / _GIB:,.2f} GiB are available"
         )
 
 

@@ -193,7 +193,9 @@ def plan(parts: Parts, state: FleetState, keys: Keys, available: jax.Array | Non
     config = parts.config
     signals = observe(parts, state, keys)
     score, memory = parts.rule.score(signals, state.priority, keys.score)
-    min_time = jnp.where(state.resetting, config.hard_reset_time, config.min_teleop_time + unready(parts, state))
+    late = unready(parts, state)
+    min_teleop_time = jnp.minimum(config.min_teleop_time, jnp.iinfo(jnp.int32).max - late) + late
+    min_time = jnp.where(state.resetting, config.hard_reset_time, min_teleop_time)
     binding = score if state.weight is None else parts.binding.score(signals, state.priority, keys.score)[0]
     humans = parts.allocate(binding, state.humans, min_time, keys.ties, available, signals)
     helped = helper_of(humans, config.num_robots) >= 0

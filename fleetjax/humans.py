@@ -145,10 +145,12 @@ class Lines(NamedTuple):
     Attributes:
         works: bool[N] whether each worked at the last timestep.
         poor: bool[N] which are poor, in models with poor and good ones.
+        run_length: f32[N] timesteps of the whole run, of which a program may compute a part.
     """
 
     works: jax.Array
     poor: jax.Array
+    run_length: jax.Array
 
 
 class Links(NamedTuple):
@@ -161,6 +163,10 @@ class Links(NamedTuple):
 
     init: Callable[[jax.Array], Lines]
     quality: Callable[[Lines, jax.Array], jax.Array]
+
+
+def _lines(config: Any, works: jax.Array, poor: jax.Array) -> Lines:
+    return Lines(works, poor, jnp.full(config.num_robots, config.num_steps, jnp.float32))
 
 
 def draw(quality: jax.Array, key: jax.Array) -> jax.Array:
@@ -179,12 +185,12 @@ def make_gilbert_elliott(config: Any) -> Links:
 
     def init(key: jax.Array) -> Lines:
         works = jax.random.uniform(key, (config.num_robots,)) >= failure / jnp.maximum(failure + repair, 1e-9)
-        return Lines(works, jnp.zeros(config.num_robots, bool))
+        return _lines(config, works, jnp.zeros(config.num_robots, bool))
 
     return Links(init, lambda lines, timestep: jnp.where(lines.works, 1.0 - failure, repair))
 
 
-POOR, GOOD, POOR_SHARE = 0.2, 0.9, 0.7  # chances that links work, and the share of robots with poor ones
+POOR, GOOD, POOR_TENTHS = 0.2, 0.9, 7  # chances that links work, and how many of ten robots have poor ones
 SWAP_BEGINS, SWAP_ENDS = 0.2, 0.8  # shares of the run
 
 
@@ -197,8 +203,8 @@ def make_unequal(config: Any) -> Links:
 
     def init(key: jax.Array) -> Lines:
         n = config.num_robots
-        poor = jnp.zeros(n, bool).at[tie_order(key, n)[: int(POOR_SHARE * n)]].set(True)
-        return Lines(jnp.ones(n, bool), poor)
+        poor = jnp.zeros(n, bool).at[tie_order(key, n)[: n * POOR_TENTHS // 10]].set(True)
+        return _lines(config, jnp.ones(n, bool), poor)
 
     def quality(lines: Lines, timestep: jax.Array) -> jax.Array:
         del timestep
@@ -216,7 +222,7 @@ def make_swapping(config: Any) -> Links:
     init, before = make_unequal(config)
 
     def quality(lines: Lines, timestep: jax.Array) -> jax.Array:
-        done = timestep.astype(jnp.float32) / config.num_steps
+        done = timestep.astype(jnp.float32) / lines.run_length
         share = jnp.clip((done - SWAP_BEGINS) / (SWAP_ENDS - SWAP_BEGINS), 0.0, 1.0)
         chance = before(lines, timestep)
         return chance + share * (POOR + GOOD - 2.0 * chance)

@@ -75,6 +75,27 @@ def test_people_who_act_at_once_need_no_time():
     assert fitting.fit(rows, [0], absence_time=100.0).takeover_time == 0
 
 
+@pytest.mark.parametrize(
+    ("times", "longer"), [([0] * 10, [3]), ([0] * 20, [30]), ([0] * 20 + [10], []), ([0] * 5 + [20] * 5, [])]
+)
+def test_people_of_whom_many_act_at_once_have_the_mean_of_their_times(times, longer):
+    rows = session(np.array(times + longer, float), np.zeros(len(times + longer)), 1000)
+    end = np.flatnonzero(rows["robot"][:, 0] >= 0)
+    if longer:  # the last help ends before the first action
+        rows["given"][end[-longer[0] - 2] :, 0] = 0
+        rows = np.concatenate([rows, record([PERSON], [-1], [0])])
+    found = fitting.fit(rows, [0], absence_time=100.0)
+    assert 0 <= found.takeover_time <= max(times + longer) + 2
+    assert found.takeover_spread <= fitting.WIDEST
+
+
+def test_people_who_are_hardly_there_are_away_as_long_as_the_model_allows():
+    seat = [PERSON] * 10 + [EMPTY] * 2000 + [PERSON]
+    robot = [n // 2 for n in range(10)] + [-1] * 2001
+    found = fitting.fit(record(seat, robot, [1] * 10 + [0] * 2001), [0], absence_time=100.0)
+    assert (found.absence, found.absence_time) == (0.99, 2000)
+
+
 def test_too_few_actions_are_refused():
     rows = record([PERSON] * 4, [1, 1, 2, 2], [0, 1, 0, 1])
     with pytest.raises(ValueError, match="took over robots 2 times; at least 5"):

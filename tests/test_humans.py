@@ -256,11 +256,19 @@ def test_the_scenarios_of_unequal_links():
         assert_same(lines, unequal.init(jax.random.key(seed)))
         assert lines.poor.sum() == 7
         chosen.add(tuple(np.asarray(lines.poor).tolist()))
+        part = humans.LINK_MODELS.get("swapping")(config.replace(num_steps=10))  # of the run, as a program computes it
         for t, poor, good in ((0, 0.2, 0.9), (20, 0.2, 0.9), (50, 0.55, 0.55), (80, 0.9, 0.2), (99, 0.9, 0.2)):
             expected = np.where(lines.poor, poor, good)
-            np.testing.assert_allclose(swapping.quality(lines, jnp.int32(t)), expected, rtol=1e-5)
+            for links in (swapping, part):
+                np.testing.assert_allclose(links.quality(lines, jnp.int32(t)), expected, rtol=1e-5)
         np.testing.assert_allclose(unequal.quality(lines, jnp.int32(99)), np.where(lines.poor, 0.2, 0.9), rtol=1e-6)
     assert len(chosen) == 3
+
+
+@pytest.mark.parametrize(("number", "poor"), [(90, 63), (170, 119), (180, 126)])
+def test_seven_of_ten_links_are_poor(number, poor):
+    config = fleetjax.make_config("navigation", num_robots=number, link_model="unequal")
+    assert humans.LINK_MODELS.get("unequal")(config).init(jax.random.key(0)).poor.sum() == poor
 
 
 def test_poor_links_stay_poor_through_a_run():

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from commands import contents, refused
 
-from fleetjax import cli
+from fleetjax import checks, cli
 from fleetjax.io import chunks, crew, files, flags, folder, group, metrics_csv, place, resumable, study, sweep
 from fleetjax.io.errors import Diverged
 
@@ -391,6 +391,28 @@ def test_a_group_that_was_stopped_starts_again(tmp_path, alone, monkeypatch):
     assert group.complete(group_of_two, checkpoint_every=0) == ["", ""]
     for run in group_of_two:
         assert_agree(run.folder, alone[40][run.folder.name])
+
+
+def test_more_seeds_must_leave_groups_as_they_are(capsys, tmp_path):
+    output = tmp_path / "out"
+    asked = study.make_study([NAV], {"output": str(output), "seed": [0, 1, 2], "seeds_per_program": 2})
+    output.mkdir()
+    files.write_json(output / sweep.FILE, {"runs": asked.blocks, "log_interventions": False, "seeds_per_program": 2})
+    more = asked._replace(blocks=tuple({**block, "seed": [0, 1, 2, 3]} for block in asked.blocks))
+    with pytest.raises(ValueError, match="add whole groups of seeds_per_program = 2 seeds"):
+        sweep.check_folder(more, study.plan(more))
+    sweep.check_folder(asked, study.plan(asked))
+
+
+def test_runs_side_by_side_must_fit_the_memory_together(monkeypatch, tmp_path):
+    monkeypatch.setattr(checks, "memory", lambda: 0)
+    needed = {}
+    for number, who in ((1, "the run needs"), (2, "2 runs side by side need")):
+        asked = study.make_study([NAV], {"output": str(tmp_path), "seed": [0, 1], "seeds_per_program": number})
+        with pytest.raises(ValueError, match=rf"{who} at least \d") as error:
+            study.plan(asked)
+        needed[number] = float(re.findall(r"at least ([\d.]+) GiB", str(error.value))[0])
+    assert needed[2] == pytest.approx(2 * needed[1], abs=0.02)
 
 
 def test_a_folder_keeps_its_number_of_seeds_per_program(capsys, tmp_path):

@@ -11,6 +11,7 @@ from fleetjax.console.engine import PERSON
 from fleetjax.field import FIELDS
 
 FEWEST = 5  # first actions that a fit needs
+WIDEST = 2.0  # deviation of times, as a share of their mean, that a lognormal fit may have
 
 
 class Takeover(NamedTuple):
@@ -102,18 +103,25 @@ def fit(rows: np.ndarray, seats: Iterable[int], *, absence_time: float) -> Fit:
     lag = max(_lognormal(groups[1])[0] - mean, 0.0) if len(enough) == 2 else 0.0
     spans, gaps = zip(*(absences(rows, seat) for seat in seats), strict=True)
     away = [gap for each in gaps for gap in each]
-    share = sum(away) / max(sum(spans), 1)
+    share = min(sum(away) / max(sum(spans), 1), FIELDS["absence"].high or 1.0)
     return Fit(mean, spread, lag, share, sum(away) / len(away) if away else absence_time)
 
 
 def _lognormal(times: list[Takeover]) -> tuple[float, float]:
-    """Return mean and standard deviation, as a share of the mean, of the likeliest lognormal distribution."""
+    """Return mean and standard deviation, as a share of the mean, of the likeliest lognormal distribution.
+
+    Where many act at once and some much later, no lognormal distribution fits; then these are the times' own, of which the
+    deviation is at most `WIDEST`.
+    """
     ends = [(max(one.time - 0.5, 0.0), one.time + 0.5) for one in times if one.acted]
     longer = [float(one.time) for one in times if not one.acted]
     if max(high for _, high in ends) <= 0.5 and not longer:
         return 0.0, FIELDS["takeover_spread"].default  # all acted at once
     with np.errstate(divide="ignore"):  # the search may try a distribution that excludes a time
         shape, _, scale = stats.lognorm.fit(stats.CensoredData(interval=ends, right=longer), floc=0)
+    if shape > math.sqrt(math.log1p(WIDEST**2)):
+        mean = float(np.mean([one.time for one in times]))
+        return mean, min(float(np.std([one.time for one in times])) / mean, WIDEST)
     return float(scale * math.exp(shape**2 / 2)), math.sqrt(math.expm1(shape**2))
 
 

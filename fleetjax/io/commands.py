@@ -13,7 +13,7 @@ import numpy as np
 from fleetjax import envs, sharding
 from fleetjax.checks import check_mesh, check_run
 from fleetjax.config import Config, make_config
-from fleetjax.console.controls import CONTROLS
+from fleetjax.console.controls import CONTROLS, check_people
 from fleetjax.envs import get_defaults, list_envs
 from fleetjax.field import FIELDS, every_field, owners_in_words
 from fleetjax.io import (
@@ -148,6 +148,7 @@ def _run_to_resume(arguments: argparse.Namespace, given: Mapping[str, Any]) -> f
     difference = folder.first_difference(run._replace(config=run.config.replace(**given), seed=seed), run)
     if difference:
         raise ValueError(f"{difference}; omit it, or start a new run")
+    check_run(run.config)
     return run
 
 
@@ -325,6 +326,7 @@ def render_robots(arguments: argparse.Namespace) -> None:
             shown = {"num_robots": arguments.num_shown, "num_humans": arguments.num_shown}
             config = make_config(config.environment, "expert", **shown, backend=config.backend)
         policy = folder.read_policy(run) if run and who == "robot" else None
+        check_run(config)
         render.check(config)
     output = files.check_free(arguments.output, overwrite=arguments.overwrite)
     seed = arguments.seed if arguments.seed is not None else run.seed if run else 0
@@ -370,6 +372,7 @@ def replay(arguments: argparse.Namespace) -> None:
 
     with _refusing():
         run = folder.read_run(arguments.run)
+        check_people(run.config)
         rows = replaying.read_record(run)
     metrics = replaying.replay(run, rows)
     compared = " and ".join(replaying.compared(run.config))

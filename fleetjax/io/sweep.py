@@ -52,6 +52,15 @@ def check_folder(study: Study, runs: Sequence[folder.Run]) -> None:
         )
         difference = folder.first_difference(here[run.folder], run)
         files.expect(not difference, f"{run.folder.name}: {difference} in {path}; choose another --output")
+    theirs, ours = (
+        {frozenset(run.folder for run in group) for group in groups(each, study.seeds_per_program)}
+        for each in (plan(held), runs)
+    )
+    files.expect(
+        theirs <= ours,
+        f"with these seeds, other runs than in {path} would be side by side, and round differently; add whole groups of "
+        f"seeds_per_program = {study.seeds_per_program} seeds behind the others, or choose another --output",
+    )
 
 
 def _read(study: Study) -> Study:

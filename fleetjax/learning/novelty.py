@@ -10,9 +10,9 @@ from fleetjax.envs import Env
 from fleetjax.learning import buffer
 from fleetjax.learning.estimator import Estimator
 from fleetjax.learning.imitation import HumanData, Learner, PolicyState
+from fleetjax.priority.learnt import NEIGHBOURS
 from fleetjax.supervisors import Supervisor
 
-NEIGHBOURS = 5  # K
 REFERENCES, REFERENCE_IMAGES = 1024, 256  # states that stand for all human data
 REPLACED = 4  # of them at each gradient step
 

@@ -5,6 +5,8 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 
 from fleetjax import sharding
 from fleetjax.field import PARAMETERS
@@ -15,6 +17,7 @@ from fleetjax.priority.ranks import above
 from fleetjax.types import Signals
 
 MEMORY = 1000.0  # timesteps within which quantiles forget
+NEIGHBOURS = 5  # K of CRSAIL
 NARROWEST = 1e-3  # spread of an ensemble that agrees
 
 
@@ -101,8 +104,16 @@ def _at_a_rate(value_of: Callable[[Signals], jax.Array], config, rate: str) -> P
     return Priority(empty, score)
 
 
+def _check_states(config, spec) -> None:
+    """Check that demonstrations have enough states for a distance to the 5th nearest of the others."""
+    del spec
+    number = config.num_demonstrations
+    if not isinstance(number, Tracer) and np.min(np.asarray(number)) <= NEIGHBOURS:
+        raise ValueError(f"num_demonstrations = {number} must be more than {NEIGHBOURS} for algorithm = 'crsail'")
+
+
 LEARNT: dict[str, Algorithm] = {
-    "crsail": Algorithm(crsail, estimators=("novelty",), parameters=PARAMETERS["crsail"]),
+    "crsail": Algorithm(crsail, estimators=("novelty",), parameters=PARAMETERS["crsail"], check=_check_states),
     "conformal": Algorithm(conformal, parameters=PARAMETERS["conformal"]),
     "aim": Algorithm(aim, estimators=("intervention",), parameters=PARAMETERS["aim"]),
     "iifl": Algorithm(iifl, estimators=("divergence",), parameters=PARAMETERS["iifl"]),

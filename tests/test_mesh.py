@@ -17,7 +17,6 @@ import fleetjax
 from fleetjax import priority, sharding
 from fleetjax.allocation import choose
 from fleetjax.experiment import step_once
-from fleetjax.field import ORDERS
 from fleetjax.humans import HUMAN_MODELS, LINK_MODELS
 from fleetjax.learning import buffer
 from fleetjax.priority import lexicographic
@@ -145,9 +144,20 @@ def assert_a_step_agrees(config):
     return alone
 
 
+def with_memory_or_allocator():
+    """Return the algorithms that remember something of the fleet, or choose robots in a way of their own."""
+    found = []
+    for name in fleetjax.list_algorithms():
+        algorithm = priority.get_algorithm(name)
+        memory = jax.eval_shape(algorithm.make_priority(small(name, num_humans=40)).init)
+        if jax.tree.leaves(memory) or algorithm.make_allocate is not priority.Algorithm.make_allocate:
+            found.append(name)
+    return found
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [x for x in fleetjax.list_algorithms() if x not in ORDERS or x in ("cur", "ur")])  # one code
-def test_every_algorithm_helps_the_same_robots_on_a_mesh(name):
+@pytest.mark.parametrize("name", with_memory_or_allocator())
+def test_an_algorithm_with_a_memory_or_an_allocator_helps_the_same_robots_on_a_mesh(name):
     own = priority.get_algorithm(name).defaults(small("constraint"))
     humans = {"num_humans": own.get("num_humans", SMALL["num_humans"])}
     assert_a_step_agrees(small(name, num_steps=1, initial_period=0, human_capacity=500, **humans))

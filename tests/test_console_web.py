@@ -77,7 +77,7 @@ def place(session, *robots: base.EnvState) -> None:
     """Put robots where they are wanted, under a policy that hardly moves them."""
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *robots)
     policy = session.engine.state.policy
-    policy = policy._replace(params=jax.tree.map(lambda x: 0.1 * x, policy.params))
+    policy = policy._replace(params=jax.tree.map(lambda x: 0.01 * x, policy.params))
     session.engine.state = session.engine.state._replace(env=stacked, policy=policy)
 
 

@@ -634,6 +634,7 @@ def test_the_jeffreys_divergence():
 # Discrete actions
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("agree", [True, False])
 def test_who_acts_is_known_though_human_and_robot_agree(agree):
     """With discrete actions a correction of 0 is common: the human is there, and did what the robot would."""

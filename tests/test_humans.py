@@ -171,6 +171,7 @@ def test_late_actions_are_never_those_for_the_robots_last_episode():
     np.testing.assert_allclose(100 * done[:, 0, 0], [0, 0, 0, 0, 1, 2, 6, 6, 6, 6, 7, 8], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_late_discrete_actions_are_actions():
     """All that is taught on block pushing is one of its four actions, from the first timestep on."""
     config = fleetjax.make_config("block_push", "random", action_delay=4.0, random_threshold=0.0, num_steps=12)
@@ -216,6 +217,7 @@ def test_absence_is_a_share_of_the_time_in_spells_of_a_mean_length():
     np.testing.assert_allclose(away.sum(axis=0)[1:] / ends, 10, rtol=0.15)
 
 
+@pytest.mark.slow
 def test_nobody_who_is_away_helps():
     config = fleetjax.make_config("navigation", absence=0.9, absence_time=20.0, **SMALL)
     fleet, state = make_fleet(config, envs.make("navigation")), fleetjax.prepare(config, jax.random.key(0))
@@ -271,12 +273,14 @@ def test_seven_of_ten_links_are_poor(number, poor):
     assert humans.LINK_MODELS.get("unequal")(config).init(jax.random.key(0)).poor.sum() == poor
 
 
+@pytest.mark.slow
 def test_poor_links_stay_poor_through_a_run():
     lines = result_of(link_model="unequal").state.links.values
     assert lines.poor.sum() == 14
     assert not lines.works.all()
 
 
+@pytest.mark.slow
 def test_no_action_arrives_over_a_link_that_does_not_work():
     """With links that never work, nothing is taught; violations are still reset."""
     result = result_of(link_model="gilbert_elliott", link_failure_rate=1.0, link_repair_rate=0.0)
@@ -296,6 +300,7 @@ IMPERFECT = {
 }
 
 
+@pytest.mark.slow
 def test_runs_with_imperfect_people_go_on_from_a_state():
     config = fleetjax.make_config("navigation", link_model="unequal", **SMALL | IMPERFECT)
     start = compiled(fleetjax.prepare)(config, jax.random.key(0))
@@ -308,6 +313,7 @@ def test_runs_with_imperfect_people_go_on_from_a_state():
     assert np.sum(whole.metrics.human_steps) > 0
 
 
+@pytest.mark.slow
 def test_values_sweep_without_compiling_again():
     config = fleetjax.make_config("navigation", **SMALL | IMPERFECT)
     run = jax.jit(fleetjax.run, compiler_options={"xla_backend_optimization_level": 0})

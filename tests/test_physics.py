@@ -305,7 +305,7 @@ def test_backends_are_resolved():
 
 
 def test_warp_is_refused_without_a_gpu_before_anything_is_computed(capsys, tmp_path, monkeypatch):
-    remedy = r"backend = 'warp' needs an NVIDIA GPU and pip install \"fleetjax\[cuda12,warp\]\" \(.*{}.*\); or choose"
+    remedy = r"backend = 'warp' needs an NVIDIA GPU and pip install \"\.\[cuda12,warp\]\" \(.*{}.*\); or choose"
     for gpu, installed, missing in (
         (False, False, "JAX finds no GPU here and warp-lang is not installed"),
         (False, True, "JAX finds no GPU here"),

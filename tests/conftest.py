@@ -33,7 +33,7 @@ hypothesis.settings.load_profile("fleetjax")
 
 def pytest_configure(config: pytest.Config) -> None:
     """Compile quickly where no slow test runs: in this process, in xdist's, and in those that tests start."""
-    if config.option.markexpr == "not slow":
+    if config.option.markexpr == "not slow and not long":
         os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK_FLAGS}".strip()
     import jax  # only now, since it reads the environment

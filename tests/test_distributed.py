@@ -94,8 +94,9 @@ def test_several_processes_give_the_bits_of_one_with_as_many_devices(tmp_path, g
     assert complete(tmp_path / "four", 4, 1, **given) == one
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("environment", ["navigation", "humanoid"])
+@pytest.mark.parametrize(
+    "environment", [pytest.param("navigation", marks=pytest.mark.slow), pytest.param("humanoid", marks=pytest.mark.long)]
+)
 def test_a_stopped_run_resumes_on_other_processes_and_on_other_devices(tmp_path, environment):
     given = {"environment": environment, "algorithm": "cur", "num_steps": 150, **CRITICS}
     whole = complete(tmp_path / "whole", 1, 4, **given)
@@ -158,7 +159,7 @@ def test_a_process_says_in_one_line_that_another_was_killed(lost):
 
 
 @pytest.mark.parametrize("lost", [0, 1])
-@pytest.mark.parametrize(("timeout", "silence"), [(10, 600), pytest.param(600, 10, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("timeout", "silence"), [(10, 600), pytest.param(600, 10, marks=pytest.mark.long)])
 def test_a_process_says_in_one_line_that_another_hangs(lost, timeout, silence):
     started = exchanging(timeout, silence)
     started[lost].send_signal(signal.SIGSTOP)
@@ -181,9 +182,16 @@ def whole(tmp_path_factory):
     return complete(tmp_path_factory.mktemp("whole") / "run", 1, 4, **LONG)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("lost", [0, 1])
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize(
+    ("how", "lost"),
+    [
+        pytest.param(signal.SIGKILL, 0, marks=pytest.mark.slow),
+        *(
+            pytest.param(*case, marks=pytest.mark.long)
+            for case in ((signal.SIGKILL, 1), (signal.SIGSTOP, 0), (signal.SIGSTOP, 1))
+        ),
+    ],
+)
 def test_a_run_that_lost_a_process_ends_and_resumes_on_another_number_of_processes(tmp_path, whole, how, lost):
     started = start(tmp_path / "run", 2, 2, step_timeout=600, **LONG)
     wait_for_rows(tmp_path / "run", 150)

@@ -290,13 +290,11 @@ def test_samples_side_by_side_are_those_one_after_the_other(config, monkeypatch)
 
 @pytest.mark.slow
 def test_the_estimate_of_memory_is_what_the_program_takes(config):
-    for length in (36, 100):
-        soft = config.replace(allocation="soft", num_steps=length, human_capacity=300)
-        env = fleetjax.envs.make("navigation")
-        derive = gradients.make_gradient(soft, env, human_time, ("risk_threshold",), "relaxed", {}, 2)
-        values, state = {"risk_threshold": jax.typeof(soft.risk_threshold)}, checks.state_shapes(soft, env)
-        program = jax.jit(derive).lower(values, KEYS[0], state).compile()
-        assert 0.5 < gradients.reverse_bytes(soft, env) / program.memory_analysis().temp_size_in_bytes < 2
+    soft, env = config.replace(allocation="soft", num_steps=64, human_capacity=300), fleetjax.envs.make("navigation")
+    derive = gradients.make_gradient(soft, env, human_time, ("risk_threshold",), "relaxed", {}, 2)
+    values, state = {"risk_threshold": jax.typeof(soft.risk_threshold)}, checks.state_shapes(soft, env)
+    program = jax.jit(derive).lower(values, KEYS[0], state).compile()
+    assert 0.5 < gradients.reverse_bytes(soft, env) / program.memory_analysis().temp_size_in_bytes < 2
 
 
 @pytest.mark.slow
@@ -399,18 +397,25 @@ def test_bad_requests_are_refused_before_anything_is_computed(config, monkeypatc
         fleetjax.validate(config.replace(allocation="soft", temperature=0.0))
 
 
-@pytest.mark.slow
-def test_mjx_has_only_forward_derivatives():
+@pytest.fixture(scope="module")
+def on_mjx():
     tiny = {**TINY, "num_robots": 2, "num_humans": 1, "num_steps": 3, "backend": "mjx", "learning_rate": 0.01}
-    config = fleetjax.make_config("humanoid", "weighted", **tiny)
-    assert "use method = 'forward' or 'smoothed'" in refused(config, method="relaxed")
+    return fleetjax.make_config("humanoid", "weighted", **tiny)
 
+
+@pytest.mark.slow
+def test_mjx_has_no_reverse_derivatives(on_mjx):
+    assert "use method = 'forward' or 'smoothed'" in refused(on_mjx, method="relaxed")
+
+
+@pytest.mark.long
+def test_forward_derivatives_on_mjx_are_those_of_differences(on_mjx):
     def reward(metrics, config):
         return jnp.sum(metrics.reward)
 
-    found = compiled(partial(fleetjax.sensitivity, fields="learning_rate", objective=reward, method="forward"))(config, KEYS[0])
-    state = compiled(fleetjax.prepare)(config, KEYS[0])
-    run = compiled(lambda rate: reward(fleetjax.run(config.replace(learning_rate=rate), KEYS[0], state).metrics, config))
+    derive = compiled(partial(fleetjax.sensitivity, fields="learning_rate", objective=reward, method="forward"))
+    found, state = derive(on_mjx, KEYS[0]), compiled(fleetjax.prepare)(on_mjx, KEYS[0])
+    run = compiled(lambda rate: reward(fleetjax.run(on_mjx.replace(learning_rate=rate), KEYS[0], state).metrics, on_mjx))
     difference = (run(jnp.float32(0.0101)) - run(jnp.float32(0.0099))) / 0.0002
     np.testing.assert_allclose(found.gradient["learning_rate"], difference, rtol=0.1)
     assert difference != 0

@@ -660,8 +660,13 @@ def test_a_run_that_fails_is_told_and_the_others_go_on(tmp_path, spawn, whole):
     assert results(damaged) == whole[0]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("options", [("--workers", 1), ("--launcher", "local", "--jobs", 2, "--lease", 3)])
+@pytest.mark.parametrize(
+    "options",
+    [
+        pytest.param(("--workers", 1), marks=pytest.mark.slow),
+        pytest.param(("--launcher", "local", "--jobs", 2, "--lease", 3), marks=pytest.mark.long),
+    ],
+)
 def test_groups_survive_kills(tmp_path, spawn, alone, options):
     output = tmp_path / "out"
     command = ("sweep", NAV, *EXPERT, "--num-steps", LONG, "--seeds-per-program", 2, *options, "--output", output)

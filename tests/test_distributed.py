@@ -82,11 +82,13 @@ def wait_for_rows(folder, number):
         time.sleep(0.1)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "given",
-    [{}, {"algorithm": "cur", **CRITICS}, {"environment": "humanoid", "algorithm": "cur", **CRITICS}],
-    ids=["random", "critics", "physics"],
+    [
+        pytest.param({}, marks=pytest.mark.slow, id="random"),
+        pytest.param({"algorithm": "cur", **CRITICS}, marks=pytest.mark.long, id="critics"),
+        pytest.param({"environment": "humanoid", "algorithm": "cur", **CRITICS}, marks=pytest.mark.long, id="physics"),
+    ],
 )
 def test_several_processes_give_the_bits_of_one_with_as_many_devices(tmp_path, given):
     one = complete(tmp_path / "one", 1, 4, **given)
@@ -94,9 +96,8 @@ def test_several_processes_give_the_bits_of_one_with_as_many_devices(tmp_path, g
     assert complete(tmp_path / "four", 4, 1, **given) == one
 
 
-@pytest.mark.parametrize(
-    "environment", [pytest.param("navigation", marks=pytest.mark.slow), pytest.param("humanoid", marks=pytest.mark.long)]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("environment", ["navigation", "humanoid"])
 def test_a_stopped_run_resumes_on_other_processes_and_on_other_devices(tmp_path, environment):
     given = {"environment": environment, "algorithm": "cur", "num_steps": 150, **CRITICS}
     whole = complete(tmp_path / "whole", 1, 4, **given)

@@ -272,7 +272,7 @@ def test_a_width_may_be_traced(config):
     assert jax.eval_shape(found, config).gradient["risk_weight"].shape == ()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_samples_side_by_side_are_those_one_after_the_other(config, monkeypatch):
     loss = lambda metrics, config: jnp.sum(metrics.policy_loss)  # noqa: E731
     derive = partial(fleetjax.sensitivity, config, KEYS[0], "learning_rate", objective=loss, num_samples=6)

@@ -193,8 +193,13 @@ def test_where_nothing_rounds_a_run_agrees_to_the_bit():
     assert not divided.state.env.obs.sharding.is_fully_replicated
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("algorithm", ["expert", "random", "constraint"])
+@pytest.mark.parametrize(
+    "algorithm",
+    [
+        pytest.param("expert", marks=pytest.mark.slow),
+        *(pytest.param(x, marks=pytest.mark.long) for x in ("random", "constraint")),
+    ],
+)
 def test_a_run_of_humanoids_in_native_physics_agrees_in_what_does_not_round(algorithm):
     num_humans = SMALL["num_robots"] if algorithm == "expert" else 8
     given = {"num_steps": 12, "initial_period": 0, "num_humans": num_humans, "backend": "native"}
@@ -253,12 +258,10 @@ def exchanged(config):
     ("algorithm", "environment", "number"),
     [
         ("random", "navigation", 11),
+        pytest.param("random", "navigation", 11, marks=pytest.mark.slow),  # optimised
         *(
-            pytest.param(*case, marks=pytest.mark.slow)
-            for case in [
-                *(("random", "navigation", 11), ("cur", "navigation", 18)),  # all but the first test optimised programs
-                *(("random", "humanoid", 11), ("cur", "humanoid", 17)),
-            ]
+            pytest.param(*case, marks=pytest.mark.long)
+            for case in [("cur", "navigation", 18), ("random", "humanoid", 11), ("cur", "humanoid", 17)]
         ),
     ],
 )

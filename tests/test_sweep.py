@@ -660,13 +660,8 @@ def test_a_run_that_fails_is_told_and_the_others_go_on(tmp_path, spawn, whole):
     assert results(damaged) == whole[0]
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        pytest.param(("--workers", 1), marks=pytest.mark.slow),
-        pytest.param(("--launcher", "local", "--jobs", 2, "--lease", 3), marks=pytest.mark.long),
-    ],
-)
+@pytest.mark.long
+@pytest.mark.parametrize("options", [("--workers", 1), ("--launcher", "local", "--jobs", 2, "--lease", 3)])
 def test_groups_survive_kills(tmp_path, spawn, alone, options):
     output = tmp_path / "out"
     command = ("sweep", NAV, *EXPERT, "--num-steps", LONG, "--seeds-per-program", 2, *options, "--output", output)
@@ -727,7 +722,7 @@ def test_a_launcher_needs_submitit(capsys, tmp_path, monkeypatch):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_jobs_of_a_cluster_take_over_what_dead_ones_leave(tmp_path, spawn, whole_long):
     output, seed = tmp_path / "out", time.time_ns() % 2**32
     print("seed of the kills:", seed)

@@ -164,8 +164,8 @@ CASES = {
     ),
     "experiments/leaderboard.py": Case(
         (
-            "navigation --algorithms random --budgets 2500 --seeds 2 --output runs --results rows",
-            "navigation --algorithms random,longest_waiting --budgets 2500 --seeds 3 --output runs --results rows",
+            "navigation --algorithms longest_waiting --budgets 2500 --seeds 1 --output runs --results rows",
+            "navigation --algorithms longest_waiting --budgets 2500 --seeds 2 --output runs --results rows",
             "--rows-only --results rows",
         ),
         (r"^rows/leaderboard\.md$",),

@@ -206,7 +206,7 @@ def make_gradient(
             }
             return objective(moved, key, state)
 
-        chunk = chunk_size(config, env)
+        chunk = min(chunk_size(config, env), noise.shape[0])
         rises = jax.lax.map(lambda z: (shifted(z, 1) - shifted(z, -1)) / 2, noise, batch_size=chunk if chunk > 1 else None)
         slopes = {name: rises * noise[:, i] / widths[name] for i, name in enumerate(names)}
         gradient = {name: jnp.mean(slope) for name, slope in slopes.items()}

@@ -392,6 +392,23 @@ def fit_humans(arguments: argparse.Namespace) -> None:
     print(f"\nTimes are in timesteps. Humans like these:\nfleetjax run {run.config.environment} {' '.join(given)}")
 
 
+def lead(arguments: argparse.Namespace) -> None:
+    """Compare rules at equal human time: run what is missing of new ones, then show all that is stored."""
+    from fleetjax.io import leaderboard
+
+    with _refusing():
+        store = leaderboard.Store(arguments.results)
+        if not store.runs:
+            raise ValueError(f"{store.rows} does not exist; run this in a clone of the repository, or give --results DIR")
+        if bool(arguments.algorithms) != (arguments.action == "add"):
+            raise ValueError("name rules after `fleetjax leaderboard add`, and none after `fleetjax leaderboard show`")
+        asked = (arguments.environments, arguments.budgets, arguments.seeds, arguments.output)
+        entries = leaderboard.entries(arguments.algorithms, *asked)
+    for entry in entries:
+        leaderboard.compete(store, entry)
+    print(leaderboard.publish(store))
+
+
 COMMANDS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "run": run_fleet,
     "sweep": run_sweep,
@@ -405,4 +422,5 @@ COMMANDS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "console": supervise,
     "replay": replay,
     "humans": fit_humans,
+    "leaderboard": lead,
 }

@@ -83,6 +83,11 @@ _RENDER_ABOUT = """Draw robots as an animation, a grid of tiles. Teleoperated ro
 
 expert: the supervisor acts on every robot. robot: the trained policy of a run acts, and nobody teleoperates. mixed: the
 pre-trained fleet runs, and its humans help."""
+_LEADERBOARD_ABOUT = """Compare rules for help at equal human time. The stored runs are in the repository: start this in a clone of
+it, or name their folder with --results.
+
+show: make the table and the figure from the stored runs. add: calibrate each RULE so that it spends every budget, run it, store
+its runs, and show. The same command resumes."""
 _HUMANS_ABOUT = """Print how long people took to act on robots in a console session, how much longer if they came from another
 robot, and how often they were away: a table by seat, and the flags of `fleetjax run` that fit all of them together. Noise,
 mistakes and delays are not fitted."""
@@ -164,6 +169,7 @@ def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser
     replay = commands.add_parser("replay", help="repeat a console session from its record, and compare every bit")
     replay.add_argument("run", metavar="RUN", type=Path, help="run folder of a console session")
     _add_humans(commands)
+    _add_leaderboard(commands)
     return parser, list(commands.choices)
 
 
@@ -172,6 +178,24 @@ def _add_humans(commands: Any) -> None:
     humans = commands.add_parser("humans", help=about, usage="fleetjax humans fit RUN", description=_HUMANS_ABOUT)
     humans.add_argument("action", choices=("fit",), metavar="fit", help="fit a model")
     humans.add_argument("run", metavar="RUN", type=Path, help="run folder of a console session")
+
+
+def _add_leaderboard(commands: Any) -> None:
+    usage = "fleetjax leaderboard add RULE... [--environments ENV,...] [--budgets H,...] [--seeds N]\n"
+    usage += "       fleetjax leaderboard show"
+    about = {"help": "compare rules for help at equal human time", "description": _LEADERBOARD_ABOUT}
+    board = commands.add_parser("leaderboard", usage=usage, **about)
+    board.add_argument("action", choices=("add", "show"), help="run rules and show the table, or only show it")
+    board.add_argument("algorithms", metavar="RULE", nargs="*", help="registered algorithm")
+    where = "separated by commas [default: navigation,block_push]"
+    board.add_argument("--environments", metavar="ENV,...", type=listed(str), default=["navigation", "block_push"], help=where)
+    much = "human timesteps, separated by commas [default: those of the environment]"
+    board.add_argument("--budgets", metavar="H,...", type=listed(integer), default=(), help=much)
+    board.add_argument("--seeds", metavar="N", type=integer, default=5, help="runs of each rule at each budget [default: 5]")
+    stored = Path("experiments/results")
+    board.add_argument("--results", metavar="DIR", type=Path, default=stored, help=f"folder of stored runs [default: {stored}]")
+    runs = Path("runs/leaderboard")
+    board.add_argument("--output", metavar="DIR", type=Path, default=runs, help=f"folder of run folders [default: {runs}]")
 
 
 def _add_compare(commands: Any) -> None:

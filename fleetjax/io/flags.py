@@ -83,8 +83,8 @@ _RENDER_ABOUT = """Draw robots as an animation, a grid of tiles. Teleoperated ro
 
 expert: the supervisor acts on every robot. robot: the trained policy of a run acts, and nobody teleoperates. mixed: the
 pre-trained fleet runs, and its humans help."""
-_LEADERBOARD_ABOUT = """Compare rules for help at equal human time. The stored runs are in the repository: start this in a clone of
-it, or name their folder with --results.
+_LEADERBOARD_ABOUT = """Compare rules for help at equal human time. The stored runs are in the repository: start this in a clone
+of it, or name their folder with --results.
 
 show: make the table and the figure from the stored runs. add: calibrate each RULE so that it spends every budget, run it, store
 its runs, and show. The same command resumes."""

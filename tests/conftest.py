@@ -2,6 +2,8 @@
 
 import os
 import signal
+from collections.abc import Iterator
+from pathlib import Path
 
 import hypothesis
 import pytest
@@ -27,6 +29,9 @@ LONGEST = (
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in what a shell runs in the background; tests interrupt runs
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# Every compiled program maps memory, and Linux lets a process have about 65,000 maps; XLA crashes at the next one.
+MOST_MAPS = 30_000
+
 hypothesis.settings.register_profile("fleetjax", deadline=None, derandomize=True, max_examples=50)
 hypothesis.settings.load_profile("fleetjax")
 
@@ -50,3 +55,14 @@ def compiled_both_ways() -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the longest files first."""
     items.sort(key=lambda item: item.path.stem.removeprefix("test_") not in LONGEST)
+
+
+@pytest.fixture(autouse=True)
+def few_maps() -> Iterator[None]:
+    """Forget compiled programs before there are too many of them."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and len(maps.read_bytes().splitlines()) > MOST_MAPS:
+        import jax
+
+        jax.clear_caches()

@@ -132,16 +132,21 @@ class Part:
             print(self.path.with_suffix(suffix))
 
 
+def add_options(parser: argparse.ArgumentParser, output: Path) -> None:
+    """Let a script be told what `Part` needs; run folders go below `output` by default."""
+    parser.add_argument("--studies", type=Path, default=HERE / "studies", help="folder of the parts' files")
+    parser.add_argument("--seeds", type=int, help="number of seeds, instead of the file's")
+    parser.add_argument("--workers", type=int, help="processes [default: one for each GPU; without GPUs, one for each core]")
+    parser.add_argument("--output", type=Path, default=output, help="folder for the run folders")
+    parser.add_argument("--results", type=Path, default=HERE / "results", help="folder for rows, tables and figures")
+    parser.add_argument("--rows-only", action="store_true", help="no runs; only tables and figures")
+
+
 def main() -> None:
     """Run the parts that are asked for, then show what they gave."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     scripts.add_names(parser, "parts", PARTS)
-    parser.add_argument("--studies", type=Path, default=HERE / "studies", help="folder of the parts' files")
-    parser.add_argument("--seeds", type=int, help="number of seeds, instead of the file's")
-    parser.add_argument("--workers", type=int, help="processes [default: one for each GPU; without GPUs, one for each core]")
-    parser.add_argument("--output", type=Path, default=Path("runs/paper"), help="folder for the run folders")
-    parser.add_argument("--results", type=Path, default=HERE / "results", help="folder for rows, tables and figures")
-    parser.add_argument("--rows-only", action="store_true", help="no runs; only tables and figures")
+    add_options(parser, output=Path("runs/paper"))
     args = parser.parse_args()
     args.results.mkdir(parents=True, exist_ok=True)
     sweep.leave_gpus_to_workers()  # so policies are evaluated on the CPU

@@ -210,6 +210,11 @@ PARAMETERS: dict[str, Mapping[str, Field]] = {
     "round_robin": {
         "round_robin_threshold": Field("time without help up to which no robot is served", "timesteps", default=100.0),
     },
+    "teach_first": {
+        "teaching_time": Field(
+            "time for which humans teleoperate, all together, before they only reset", "human timesteps", default=5000.0
+        ),
+    },
     "whittle": {
         "whittle_threshold": Field("index, as worth of a timestep of help, at or below which no robot is helped", default=0.1),
         "whittle_discount": Field("what the next timestep counts", high=0.9999, default=0.99),

@@ -57,8 +57,8 @@ class Calibration(NamedTuple):
 
 
 def default_field(config: Config) -> str:
-    """Return the threshold, or the rate, by which an algorithm asks for help: its own, if it has one."""
-    endings = ("_threshold", "_rate")
+    """Return the threshold, rate or time by which an algorithm asks for help: its own, if it has one."""
+    endings = ("_threshold", "_rate", "_time")
     own = [name for ending in endings for name in config.parameters if name.endswith(ending)]
     return own[0] if own else "uncertainty_threshold"
 

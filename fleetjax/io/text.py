@@ -44,6 +44,10 @@ _KNOWN = {
     "longest_waiting": ("Longest waiting", "robots in violation, first come, first served"),
     "whittle": ("Whittle", "robots in the states in which help is worth most, by the index of a three-state chain"),
     "asa": ("ASA", "robots in violation, uncertain or at risk that stand for many others like them: submodular allocation"),
+    "teach_first": (
+        "Teach First",
+        "random moving robots until the teaching time is spent, then violations only: fleetjax's own",
+    ),
     "expert": ("Expert", "every robot is teleoperated and nothing is learnt: an upper bound on successes"),
     "weighted": (
         "Weighted sum",

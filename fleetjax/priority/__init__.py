@@ -27,6 +27,7 @@ from fleetjax.priority.baselines import BASELINES
 from fleetjax.priority.coverage import COVERAGE
 from fleetjax.priority.dagger import DAGGERS
 from fleetjax.priority.discrepancy import DISCREPANCIES
+from fleetjax.priority.early import EARLY
 from fleetjax.priority.learnt import LEARNT
 from fleetjax.priority.orders import RULES
 from fleetjax.priority.quantile import QUANTILES
@@ -51,6 +52,6 @@ __all__ = [
     "stateless",
 ]
 
-_GATES = {**QUANTILES, **DISCREPANCIES, **LEARNT, **QUEUES, **WHITTLE, **COVERAGE}
+_GATES = {**QUANTILES, **DISCREPANCIES, **LEARNT, **QUEUES, **WHITTLE, **COVERAGE, **EARLY}
 for _name, _algorithm in {**BASELINES, **DAGGERS, **_GATES, **WEIGHTED, **RULES}.items():
     register_algorithm(_name, _algorithm)

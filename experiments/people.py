@@ -1,0 +1,147 @@
+"""What is left of each rule for help when people are imperfect and links fail?
+
+    python experiments/people.py [navigation humanoid] [--seeds 5] [--workers 2] [--output runs/people]
+    python experiments/people.py --rows-only                 # tables and figures from the stored rows; no simulation
+
+The runs of an environment are those of `experiments/studies/people_ENV.toml`. Their rows go to
+`experiments/results/people_ENV.csv`, a table and a figure beside them. Repeat the command to resume: runs that have a row, and
+finished runs, are not run again.
+"""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import paper
+
+from fleetjax import statistics
+from fleetjax.config import Config, get_value
+from fleetjax.field import FIELDS, OF_HUMANS
+from fleetjax.io import comparing, figure, files, scripts, text
+from fleetjax.io.outcomes import Group, group
+
+ENVIRONMENTS = ("navigation", "humanoid")
+
+
+class Circumstance(NamedTuple):
+    """What is imperfect in a run.
+
+    Attributes:
+        name: of a parameter; "" = nothing.
+        level: its value, in words.
+    """
+
+    name: str
+    level: str
+
+
+PERFECT = Circumstance("", "perfect people")
+
+
+def circumstance(config: Config) -> Circumstance:
+    """Return what is imperfect in a run."""
+    changed = {name: float(get_value(config, name)) for name in OF_HUMANS if _differs(config, name)}
+    if config.link_model != "perfect":
+        return Circumstance("link_model", config.link_model)
+    if not changed:
+        return PERFECT
+    name = next((name for name in changed if name != "takeover_time"), "takeover_time")
+    besides = "".join(f", {other} {value:g}" for other, value in changed.items() if other != name)
+    return Circumstance(name, f"{changed[name]:g}{besides}")
+
+
+def _differs(config: Config, name: str) -> bool:
+    return float(get_value(config, name)) != FIELDS[name].default
+
+
+def table(groups: Sequence[Group]) -> str:
+    """Return the successes of each rule in each circumstance, and their share of those with perfect people."""
+    rules = list(dict.fromkeys(one.config.algorithm for one in groups))
+    places = dict.fromkeys(circumstance(one.config) for one in groups)
+    rows: list[tuple[str, ...]] = [("", "level", *map(text.label, rules))]
+    for place in places:
+        cells = [_cell(groups, rule, place) for rule in rules]
+        rows.append((place.name.replace("_", " "), place.level.replace("_", " "), *cells))
+    note = "Mean successes (95 % interval; range below 5 seeds), and their share of those with perfect people."
+    return f"{text.markdown_table(rows)}\n\n{note}\n"
+
+
+def _find(groups: Sequence[Group], rule: str, place: Circumstance) -> np.ndarray:
+    """Return the successes of a rule in a circumstance, of each seed; empty if there are none."""
+    found = [one for one in groups if one.config.algorithm == rule and circumstance(one.config) == place]
+    return np.array([value for one in found for value in comparing.values_by_seed(one, "successes").values()])
+
+
+def _cell(groups: Sequence[Group], rule: str, place: Circumstance) -> str:
+    values, perfect = (_find(groups, rule, where) for where in (place, PERFECT))
+    if not len(values):
+        return ""
+    low, high = statistics.mean_bounds(values)
+    share = f", {100 * values.mean() / perfect.mean():.0f} %" if place.name and len(perfect) else ""
+    return f"{text.count(values.mean())} ({text.count(float(low))} to {text.count(float(high))}){share}"
+
+
+def draw(groups: Sequence[Group]) -> bytes:
+    """Return the figure: successes by the level of each imperfection, a panel for each, a line for each rule."""
+    import matplotlib.pyplot as plt
+
+    rules = list(dict.fromkeys(one.config.algorithm for one in groups))
+    places = list(dict.fromkeys(circumstance(one.config) for one in groups))
+    names = [name for name in dict.fromkeys(place.name for place in places) if name]
+    with figure.style():
+        columns = min(4, len(names))
+        rows = -(-len(names) // columns)
+        canvas, axes = plt.subplots(rows, columns, figsize=(4 * columns, 3.2 * rows), sharey=True, squeeze=False)
+        for ax, name in zip(axes.flat, names, strict=False):
+            _panel(ax, groups, rules, [place for place in places if place.name in ("", name)])
+            ax.set_title(name.replace("_", " "))
+        for ax in axes.flat[len(names) :]:
+            ax.set_visible(False)
+        axes[0, 0].set_ylabel("successes")
+        axes[0, 0].set_ylim(bottom=0)
+        axes[0, 0].legend(frameon=False, fontsize=8)
+        canvas.tight_layout()
+        return figure.render(canvas)
+
+
+def _panel(ax: Any, groups: Sequence[Group], rules: Sequence[str], places: Sequence[Circumstance]) -> None:
+    """Draw a panel: perfect people at the left, then one level after the other."""
+    for rule in rules:
+        found = [(i, values) for i, place in enumerate(places) if len(values := _find(groups, rule, place))]
+        middle = np.array([values.mean() for _, values in found])
+        low, high = np.array([statistics.mean_bounds(values) for _, values in found]).T
+        error = np.stack([middle - low, high - middle])
+        ax.errorbar([i for i, _ in found], middle, error, label=text.label(rule), marker="o", markersize=3, capsize=2)
+    ticks = ["perfect", *(place.level.split(",")[0].replace("_", "\n") for place in places[1:])]
+    ax.set_xticks(range(len(places)), ticks)
+
+
+class Part(paper.Part):
+    """The runs of an environment, as a part of a study."""
+
+    def show(self) -> None:
+        """Write the table and the figure of the stored rows."""
+        groups = group(list(self.rows().values()))
+        for suffix, content in {".md": table(groups).encode(), ".png": draw(groups)}.items():
+            files.write(self.path.with_suffix(suffix), content)
+            print(self.path.with_suffix(suffix))
+
+
+def main() -> None:
+    """Run what is missing, then show what is stored."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    scripts.add_names(parser, "environments", ENVIRONMENTS)
+    paper.add_options(parser, output=Path("runs/people"))
+    args = parser.parse_args()
+    args.results.mkdir(parents=True, exist_ok=True)
+    for part in [Part(f"people_{name}", args) for name in args.environments]:
+        if not args.rows_only:
+            part.run()
+        if part.rows():
+            part.show()
+
+
+if __name__ == "__main__":
+    main()

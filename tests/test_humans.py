@@ -313,7 +313,7 @@ def test_runs_with_imperfect_people_go_on_from_a_state():
     assert np.sum(whole.metrics.human_steps) > 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_values_sweep_without_compiling_again():
     config = fleetjax.make_config("navigation", **SMALL | IMPERFECT)
     run = jax.jit(fleetjax.run, compiler_options={"xla_backend_optimization_level": 0})

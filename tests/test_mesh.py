@@ -105,7 +105,8 @@ def test_a_part_of_a_ring_takes_the_rows_of_its_own_robots():
     ("algorithm", "environment"),
     [
         ("random", "navigation"),
-        *(pytest.param(*pair, marks=pytest.mark.slow) for pair in [("cur", "navigation"), ("cur", "humanoid")]),
+        pytest.param("cur", "navigation", marks=pytest.mark.slow),
+        pytest.param("cur", "humanoid", marks=pytest.mark.long),
     ],
 )
 def test_a_timestep_from_the_same_state_agrees_to_rounding(algorithm, environment):

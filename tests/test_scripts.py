@@ -34,14 +34,14 @@ class Case(NamedTuple):
         prints: regular expressions, each of which is found in what it prints, line by line.
         writes: files that are there afterwards.
         prepare: what is called with the working folder before.
-        quick: whether it is done in about 15 s.
+        pace: None if it is done in about 15 s; else "slow", or "long" if it takes a minute or more.
     """
 
     commands: tuple[str, ...]
     prints: tuple[str, ...]
     writes: tuple[str, ...] = ()
     prepare: Callable[[Path], None] = lambda place: None
-    quick: bool = False
+    pace: str | None = "slow"
 
 
 def row(*cells: str) -> str:
@@ -90,6 +90,16 @@ pretraining_steps = 2
 hidden_sizes = [8]
 """
 
+IMPERFECT = """
+[[runs]]
+
+[[runs]]
+takeover_time = [2.0, 5.0]
+
+[[runs]]
+link_model = "unequal"
+"""
+
 CASES = {
     "benchmarks/console.py": Case(("--pages 3 --ticks 10 --robots 4",), (row("3", r"\d+", r"[\d.]+", r"[\d.]+"),)),
     "benchmarks/fleet_step.py": Case(
@@ -102,10 +112,12 @@ CASES = {
             row("9", r"[\d.]+", r"[\d.]+", r"[\d.]+", r"\d+", r"\d+"),
             row("4", r"[\d,.]+", r"[\d,.]+", r"[\d.]+"),
         ),
+        pace="long",
     ),
     "benchmarks/large.py": Case(
         (f"--num-steps 2 -- {FLEET}",),
         (row("navigation", r"\d+", r"[\d,]+", r"[\d.]+", r"-?[\d,]+", r"[\d,]+"), row("8", r"\d+", r"[\d.]+", r"[\d.]+")),
+        pace="long",
     ),
     "benchmarks/physics.py": Case(
         ("humanoid --num-robots 4 --backends native --repeats 1",),
@@ -160,7 +172,7 @@ CASES = {
         ("run-0 run-1",),
         (r"^run-1: \d+ of 80 human timesteps, [\d.]+ %$", r"^mean \d+; .* random_threshold 0\.\d{5}$"),
         prepare=make_runs,
-        quick=True,
+        pace=None,
     ),
     "experiments/leaderboard.py": Case(
         (
@@ -193,8 +205,18 @@ CASES = {
         ("rows/main.csv", "rows/main.md", "rows/main.png", "rows/policies.csv", "again/policies.csv", "runs/main/sweep.json"),
         lambda place: (place / "main.toml").write_text(TINY_STUDY) and None,
     ),
+    "experiments/people.py": Case(
+        (
+            "navigation --studies . --workers 1 --output runs --results rows",
+            "navigation --studies . --results rows --rows-only",
+        ),
+        (r"^rows/people_navigation\.md$",),
+        ("rows/people_navigation.csv", "rows/people_navigation.md", "rows/people_navigation.png"),
+        lambda place: (place / "people_navigation.toml").write_text(TINY_STUDY + IMPERFECT) and None,
+        pace="long",
+    ),
     "experiments/settle_cubes.py": Case(
-        ("--number 4 --output settled.npz",), (r"^\d+ of \d+ cubes came to rest near the goal$",), ("settled.npz",), quick=True
+        ("--number 4 --output settled.npz",), (r"^\d+ of \d+ cubes came to rest near the goal$",), ("settled.npz",), pace=None
     ),
     "experiments/train_expert.py": Case(
         (
@@ -238,7 +260,10 @@ def test_every_script_has_its_case():
     assert list(CASES) == SCRIPTS
 
 
-@pytest.mark.parametrize("script", [pytest.param(s, marks=[] if c.quick else pytest.mark.slow) for s, c in CASES.items()])
+@pytest.mark.parametrize(
+    "script",
+    [pytest.param(script, marks=[getattr(pytest.mark, case.pace)] if case.pace else []) for script, case in CASES.items()],
+)
 def test_a_script_runs_and_gives_what_it_should(script, tmp_path):
     case, before, printed = CASES[script], repository(), ""
     case.prepare(tmp_path)

@@ -212,7 +212,10 @@ PARAMETERS: dict[str, Mapping[str, Field]] = {
     },
     "teach_first": {
         "teaching_time": Field(
-            "time for which humans teleoperate, all together, before they only reset", "human timesteps", default=5000.0
+            "time for which humans teleoperate, all together, before they only reset",
+            "human timesteps",
+            low=1,
+            default=5000.0,
         ),
     },
     "whittle": {

@@ -287,15 +287,23 @@ def test_longest_waiting_is_first_come_first_served():
         assert score.tolist() == np.maximum(t + 1 - since, 0).tolist()
 
 
-@given(st.integers(0, 100), st.sampled_from([0.0, 7.0, 1e6]))
+@given(st.integers(0, 100), st.sampled_from([1.0, 9.0, 1e6]))
 def test_teach_first_helps_moving_robots_until_its_time_is_spent(seed, teaching_time):
     steps = [signals_at(t, seed) for t in range(8)]
     taught = 0
     for t, (s, score) in enumerate(zip(steps, scores_of("teach_first", steps, teaching_time=teaching_time), strict=True)):
         taught += int(np.sum(s.given))
         chance = np.asarray(jax.random.uniform(jax.random.key(t), (N,)))
-        asking = np.where(np.asarray(s.violation) | (taught >= teaching_time), 0.0, chance)
-        assert score.tolist() == ranks(asking, s.violation)
+        for robot, violated in enumerate(np.asarray(s.violation)):
+            below = np.sum(score < score[robot])
+            if violated:  # last, or first
+                assert score[robot] > 0
+                assert below == (0 if 2 * taught < teaching_time else np.sum(~s.violation))
+            elif taught >= teaching_time:
+                assert score[robot] == 0
+            else:
+                behind = np.sum(~s.violation & (chance < chance[robot]))
+                assert below == behind + (np.sum(s.violation) if 2 * taught < teaching_time else 0)
 
 
 def numpy_index(chains: np.ndarray, discount: float, state: int) -> float:

@@ -10,19 +10,20 @@ from fleetjax.priority.ranks import lexicographic
 
 
 def teach_first(config) -> Priority:
-    """Moving robots at random until humans have acted `teaching_time` times in all, then robots in violation only.
+    """Random moving robots until humans have acted `teaching_time` times in all, then robots in violation only.
 
-    While they teach, humans reset robots only when no moving robot is left to help. So early violations wait, as in C.U.R.'s
-    initial period: a robot would soon fall again under a policy that has yet to learn.
+    Violations come last in the first half of that time: a robot would soon fall again under a policy that has yet to learn. In
+    the second half they come first.
 
     Reference: fleetjax's own rule; docs/beat_cur.md has what was tried, and figures.
     """
 
     def score(signals, taught, key):
         taught += sharding.total(signals.given.astype(jnp.float32))
-        teaches = ~signals.violation & (taught < config.parameters["teaching_time"])
-        chance = jax.random.uniform(key, signals.violation.shape)
-        return lexicographic(jnp.where(teaches, chance, 0.0), signals.violation), taught
+        share = taught / config.parameters["teaching_time"]
+        chance = jnp.where(signals.violation | (share >= 1), 0.0, jax.random.uniform(key, signals.violation.shape))
+        waits = signals.violation & (share < 0.5)
+        return lexicographic(signals.violation & ~waits, chance, waits), taught
 
     return Priority(init=lambda: jnp.zeros(()), score=score)
 

@@ -142,6 +142,10 @@ CASES = {
         (f"--seeds 2 -- {FLEET} --algorithm constraint --extra-demonstrations 0 --num-steps 4",),
         (row("1", r"\d+", r"[\d.]+", r"[\d.]+", "1.00"), row(r"\d+", "1", r"[\d.]+", r"[\d.]+", r"[\d.]+")),
     ),
+    "experiments/beat_cur.py": Case(
+        (f"humanoid --variants random-half,risk-last --until 4 -- {FLEET}",),
+        (row("humanoid", "random-half", r"\d+", r"\d+", r"\d+", r"\d+"), row("humanoid", "risk-last", *[r"\d+"] * 4)),
+    ),
     "experiments/claims.py": Case(
         ("--results rows", "--results rows --output claims.md"),
         (

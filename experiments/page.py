@@ -1,24 +1,29 @@
-"""Fill in the tables of `docs/results.md` from the stored rows of the study; no simulation.
+"""Fill in the tables of pages below `docs/` from stored rows; no simulation.
 
-    python experiments/page.py [--results experiments/results] [--page docs/results.md]
+    python experiments/page.py [PAGE ...] [--results experiments/results]
 
 A table stands between `<!-- NAME -->` and `<!-- end -->`, where NAME is one of:
 
 - a part of the study, such as `main`: what the algorithms achieved in it, each robot's one after the other.
 - `claims`: the verdicts of `claims.py`.
 - `missing`: how many runs of each part are stored, of how many, and what they ran on.
+- `teach_first`: how Teach First compares with C.U.R. and Random at equal human time.
+- `leaderboard`: that of `leaderboard.py`.
+- `people_ENV`: what is left of rules with imperfect people, by `people.py`.
 """
 
 import argparse
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import claims
 import numpy as np
 import paper
+import people
 
-from fleetjax.io import comparing, files, rows, text
+from fleetjax import statistics
+from fleetjax.io import comparing, files, leaderboard, rows, text
 from fleetjax.io.outcomes import Group, Outcome, group
 from fleetjax.io.study import plan
 
@@ -34,6 +39,7 @@ PUBLISHED = {  # successes of the trained policies (paper, Appendix); Fleet-TD i
         "expert": 21609,
     },
 }
+PAGES = ("results", "beat_cur", "leaderboard", "humans")
 COLUMNS = {"successes": "successes", "violations": "violations", "human_steps": "human time", "rohe": "ROHE"}
 
 
@@ -107,29 +113,64 @@ def counts(stored: Mapping[str, Outcome], number: int) -> tuple[str, ...]:
     return str(len(stored)), str(number), ", ".join(processors), ", ".join(versions)
 
 
-def main() -> None:
-    """Write the page anew."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--results", type=Path, default=paper.HERE / "results", help="folder of the rows")
-    parser.add_argument("--page", type=Path, default=paper.HERE.parent / "docs" / "results.md", help="Markdown file")
-    args = parser.parse_args()
-    alone = {f"{one.config.environment} {one.label}": one for one in groups(args.results, "policies")}
+def against_cur(found: list[Group]) -> str:
+    """Return a table of Teach First and Random beside C.U.R.: successes, and how many times C.U.R.'s they are, seed by seed."""
+    table: list[tuple[str, ...]] = [("", "seeds", "successes", "times C.U.R.'s", "violations", "human time", "idle time")]
+    for place in dict.fromkeys(one.config.environment for one in found):
+        here = {one.config.algorithm: one for one in found if one.config.environment == place}
+        reference = comparing.values_by_seed(here["cur"], "successes")
+        for algorithm in ("cur", "random", "teach_first"):
+            if algorithm in here:
+                one = here[algorithm]
+                values = comparing.values_by_seed(one, "successes")
+                shared = sorted(values.keys() & reference.keys())
+                ratio = sum(values[seed] for seed in shared) / sum(reference[seed] for seed in shared)
+                low, high = statistics.mean_bounds(np.array(list(values.values())))
+                cells = [f"{claims.NAMES[place]}, {text.label(algorithm)}", str(len(values))]
+                cells += [f"{mean(one, 'successes')} ({claims.number(float(low))} to {claims.number(float(high))})"]
+                cells += ["" if algorithm == "cur" else f"{ratio:.2f}"]
+                table.append((*cells, *(mean(one, metric) for metric in ("violations", "human_steps", "idle"))))
+    return text.markdown_table(table)
+
+
+def tables(results: Path) -> dict[str, Callable[[], str]]:
+    """Return what makes each table, by its name."""
+    alone = {f"{one.config.environment} {one.label}": one for one in groups(results, "policies")}
     every = argparse.Namespace(
-        results=args.results, studies=paper.HERE / "studies", seeds=None, workers=1, output=Path("runs/paper")
+        results=results, studies=paper.HERE / "studies", seeds=None, workers=1, output=Path("runs/paper")
     )
     parts = [part for part in paper.PARTS if part != "policies"]
-    tables = {part: achieved(groups(args.results, part), alone if part == paper.TRAINED else {}) for part in parts} | {
-        "claims": claims.verdicts(claims.Study(args.results)),
-        "missing": missing(every),
+    imperfect = [f"people_{name}" for name in people.ENVIRONMENTS]
+    return {
+        **{part: lambda part=part: achieved(groups(results, part), alone if part == paper.TRAINED else {}) for part in parts},
+        "claims": lambda: claims.verdicts(claims.Study(results)),
+        "missing": lambda: missing(every),
+        "teach_first": lambda: against_cur(groups(results, "equal_budget")),
+        "leaderboard": lambda: leaderboard.table(leaderboard.Store(results)).strip(),
+        **{name: lambda name=name: people.table(groups(results, name)).strip() for name in imperfect},
     }
-    page = args.page.read_text()
-    for name, table in tables.items():
-        page, found = re.subn(rf"(<!-- {name} -->\n)(?s:.*?)(<!-- end -->)", lambda m, t=table: f"{m[1]}\n{t}\n\n{m[2]}", page)
-        files.expect(
-            found == 1, f"{args.page} has {found} tables {name!r}; it must have one, from <!-- {name} --> to <!-- end -->"
-        )
-    files.write(args.page, page.encode())
-    print(args.page)
+
+
+def main() -> None:
+    """Write the pages anew."""
+    docs = paper.HERE.parent / "docs"
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    usual = [docs / f"{name}.md" for name in PAGES]
+    parser.add_argument("pages", metavar="PAGE", nargs="*", type=Path, default=usual, help="Markdown file [default: all]")
+    parser.add_argument("--results", type=Path, default=paper.HERE / "results", help="folder of the rows")
+    args = parser.parse_args()
+    known = tables(args.results)
+    for path in args.pages:
+        page = path.read_text()
+        names = [name for name in re.findall(r"<!-- (\w+) -->\n", page) if name != "end"]
+        files.expect(bool(names), f"{path} has no table; a table stands from <!-- NAME --> to <!-- end -->")
+        for name in names:
+            files.expect(name in known, f"{path} has an unknown table {name!r}; choose from {', '.join(known)}")
+            page = re.sub(
+                rf"(<!-- {name} -->\n)(?s:.*?)(<!-- end -->)", lambda m, n=name: f"{m[1]}\n{known[n]()}\n\n{m[2]}", page
+            )
+        files.write(path, page.encode())
+        print(path)
 
 
 if __name__ == "__main__":

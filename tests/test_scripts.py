@@ -188,7 +188,7 @@ CASES = {
         ("rows/leaderboard.csv", "rows/leaderboard.json", "rows/leaderboard.md", "rows/leaderboard.png"),
     ),
     "experiments/page.py": Case(
-        ("--results rows --page page.md",),
+        ("page.md --results rows",),
         (r"^page\.md$",),
         ("page.md",),
         make_page,

@@ -21,7 +21,7 @@ from fleetjax.io.sources import collect
 from fleetjax.priority import get_algorithm
 
 BUDGETS = {  # human timesteps
-    "navigation": (2500, 5000, 10_000),
+    "navigation": (5000, 10_000, 15_000),
     "block_push": (100, 200, 300),
     "humanoid": (10_000,),
     "anymal": (10_000,),

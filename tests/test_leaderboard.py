@@ -1,0 +1,75 @@
+"""The leaderboard: its rows, its table, its command."""
+
+import shutil
+
+import pytest
+from commands import make_metrics, refused
+
+import fleetjax
+from fleetjax import cli
+from fleetjax.io import leaderboard, sources
+
+
+@pytest.fixture
+def stored(tmp_path):
+    """A folder with the runs of C.U.R., of a rule with twice its successes, and of one whose human time nothing changes."""
+    store = leaderboard.Store(tmp_path)
+    for algorithm, field, factor in (
+        ("cur", "uncertainty_threshold", 1),
+        ("random", "random_threshold", 2),
+        ("constraint", "", 1),
+    ):
+        config = fleetjax.make_config("navigation", algorithm, initial_period=0, num_steps=40)
+        runs = []
+        for seed in range(3):
+            metrics = make_metrics(seed, 40)
+            runs.append((config, seed, metrics._replace(successes=factor * metrics.successes)))
+        value = float(fleetjax.config.get_value(config, field)) if field else 0.0
+        place = leaderboard.Place("navigation", algorithm, 5000, field, value, 5000.0, solved=bool(field))
+        store.add(place, sources.collect(runs))
+    return tmp_path
+
+
+def test_the_table_has_the_most_successes_first_and_stars_for_other_human_times(stored, capsys):
+    assert cli.main(["leaderboard", "show", "--results", str(stored)]) == 0
+    assert capsys.readouterr().out == f"{stored / 'leaderboard.md'}\n"
+    rows = [line.split("|")[1].strip() for line in (stored / "leaderboard.md").read_text().splitlines() if "|" in line]
+    assert rows[2] == "Random"
+    assert sorted(rows[3:]) == ["C.U.R.", "Constraint *"]
+    total = {seed: int(make_metrics(seed, 40).successes.sum()) for seed in range(3)}
+    low, high, mean = min(total.values()), max(total.values()), sum(total.values()) // 3
+    line = next(line for line in (stored / "leaderboard.md").read_text().splitlines() if "| Random" in line)
+    assert line.split("|")[-2].strip() == f"{mean} ({low} to {high})"  # more than C.U.R.: as many as that has
+    assert (stored / "leaderboard.png").stat().st_size > 10_000
+
+
+def test_stored_runs_and_calibrations_are_read_again(stored):
+    again = leaderboard.Store(stored)
+    assert [place.algorithm for place in again.places] == ["cur", "random", "constraint"]
+    assert len(again.runs) == 9
+    assert again.find("navigation", "random", 5000) == again.places[1]
+    assert again.find("navigation", "random", 2500) is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (("show", "cur"), "name rules after `fleetjax leaderboard add`"),
+        (("add",), "name rules after `fleetjax leaderboard add`"),
+        (("add", "curr"), "algorithm = 'curr' is unknown; the closest are"),
+        (("add", "cur", "--environments", "mars"), "environment = 'mars' has no leaderboard; choose from navigation"),
+        (("add", "cur", "--seeds", "0"), "seeds = 0 must be at least 1"),
+        (("add", "cur", "--budgets", "0"), "human_time = 0 must lie between 0 and 20000"),
+        (("add", "thrifty_dagger", "--environments", "humanoid"), "needs a goal"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(arguments, reason, stored, capsys):
+    before = {path.name: path.read_bytes() for path in stored.iterdir()}
+    assert reason in refused(capsys, "leaderboard", *arguments, "--results", stored)
+    assert {path.name: path.read_bytes() for path in stored.iterdir()} == before
+
+
+def test_without_stored_runs_it_says_where_they_are(tmp_path, capsys):
+    shutil.rmtree(tmp_path)
+    line = refused(capsys, "leaderboard", "show", "--results", tmp_path)
+    assert "does not exist; run this in a clone of the repository, or give --results DIR" in line

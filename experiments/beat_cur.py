@@ -1,4 +1,4 @@
-"""Try rules that help early, one run each: the log of docs/beat_cur.md.
+"""Try rules that help early: makes the rows of the last table in docs/beat_cur.md.
 
     python experiments/beat_cur.py [humanoid anymal allegro_hand] [--variants random-last,risk-last] [--seed 100] [--until T]
 
@@ -18,7 +18,7 @@ from fleetjax.field import Field
 from fleetjax.io import scripts, text
 from fleetjax.priority import Priority, lexicographic, stateless
 
-HOLD = 50  # timesteps for which `held` keeps a human
+HOLD = 50  # timesteps that a human stays with a robot in `held`
 
 
 class Variant(NamedTuple):
@@ -27,7 +27,7 @@ class Variant(NamedTuple):
     Attributes:
         choice: how moving robots are chosen: `random`, `uncertain`, `uncertain-random`, `risk`, `held`.
         resets: when robots in violation are helped: `first`, `last`, `half`.
-        late: uncertainty at or above which robots are helped afterwards; infinity = none is.
+        late: after T, robots at least this uncertain are helped; infinity = nobody is.
     """
 
     choice: str

@@ -1,6 +1,6 @@
-"""Compare all rules for help at equal human time: who has the most successes for what people spend?
+"""Compare the rules for help at equal human time: which has the most successes for what people spend?
 
-    python experiments/leaderboard.py [ENV ...] [--algorithms cur,random] [--budgets 2500,5000] [--seeds 5]
+    python experiments/leaderboard.py [ENV ...] [--algorithms cur,random] [--budgets 5000,10000] [--seeds 5]
     python experiments/leaderboard.py --rows-only          # table and figure from the stored rows; no simulation
 
 It does for every rule what `fleetjax leaderboard add RULE` does for one. Rows go to `experiments/results/leaderboard.csv`, what
@@ -15,7 +15,16 @@ from fleetjax import list_algorithms
 from fleetjax.io import leaderboard, scripts
 
 ORDER = (  # in which they are run
-    *("cur", "random", "ensemble_dagger", "round_robin", "lazy_dagger", "oracle_discrepancy", "quantile_ensemble"),
+    *(
+        "cur",
+        "random",
+        "teach_first",
+        "ensemble_dagger",
+        "round_robin",
+        "lazy_dagger",
+        "oracle_discrepancy",
+        "quantile_ensemble",
+    ),
     *("thrifty_quantile", "conformal", "safe_dagger", "crsail", "aim", "dropout_dagger", "asa", "weighted", "whittle", "iifl"),
     *("constraint", "constraint_trained", "longest_waiting", "thrifty_dagger"),
 )
@@ -25,7 +34,11 @@ def main() -> None:
     """Run what is missing of what is asked for, then show all that is stored."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     scripts.add_names(parser, "environments", tuple(leaderboard.BUDGETS))
-    parser.add_argument("--algorithms", type=lambda names: names.split(","), help="names, separated by commas [default: all]")
+    parser.add_argument(
+        "--algorithms",
+        type=lambda names: names.split(","),
+        help="names, separated by commas [default: all but orders and expert]",
+    )
     parser.add_argument("--budgets", type=lambda numbers: [*map(int, numbers.split(","))], help="human timesteps")
     parser.add_argument("--seeds", type=int, default=5, help="number of seeds [default: 5]")
     parser.add_argument("--output", type=Path, default=Path("runs/leaderboard"), help="folder for the run folders")

@@ -8,8 +8,8 @@ A table stands between `<!-- NAME -->` and `<!-- end -->`, where NAME is one of:
 - `claims`: the verdicts of `claims.py`.
 - `missing`: how many runs of each part are stored, of how many, and what they ran on.
 - `teach_first`: how Teach First compares with C.U.R. and Random at equal human time.
-- `leaderboard`: that of `leaderboard.py`.
-- `people_ENV`: what is left of rules with imperfect people, by `people.py`.
+- `leaderboard`: the table of `leaderboard.py`.
+- `people_ENV`: the table of `people.py`.
 """
 
 import argparse
@@ -114,7 +114,7 @@ def counts(stored: Mapping[str, Outcome], number: int) -> tuple[str, ...]:
 
 
 def against_cur(found: list[Group]) -> str:
-    """Return a table of Teach First and Random beside C.U.R.: successes, and how many times C.U.R.'s they are, seed by seed."""
+    """Return a table of Teach First and Random beside C.U.R.; ratios are of the successes over the seeds that both have."""
     table: list[tuple[str, ...]] = [("", "seeds", "successes", "times C.U.R.'s", "violations", "human time", "idle time")]
     for place in dict.fromkeys(one.config.environment for one in found):
         here = {one.config.algorithm: one for one in found if one.config.environment == place}
@@ -156,7 +156,9 @@ def main() -> None:
     docs = paper.HERE.parent / "docs"
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     usual = [docs / f"{name}.md" for name in PAGES]
-    parser.add_argument("pages", metavar="PAGE", nargs="*", type=Path, default=usual, help="Markdown file [default: all]")
+    parser.add_argument(
+        "pages", metavar="PAGE", nargs="*", type=Path, default=usual, help="Markdown file [default: those of docs/]"
+    )
     parser.add_argument("--results", type=Path, default=paper.HERE / "results", help="folder of the rows")
     args = parser.parse_args()
     known = tables(args.results)

@@ -1,11 +1,11 @@
-"""What is left of each rule for help when people are imperfect and links fail?
+"""How many successes does each rule for help keep when people are imperfect, or links fail?
 
     python experiments/people.py [navigation humanoid] [--seeds 5] [--workers 2] [--output runs/people]
     python experiments/people.py --rows-only                 # tables and figures from the stored rows; no simulation
 
 The runs of an environment are those of `experiments/studies/people_ENV.toml`. Their rows go to
-`experiments/results/people_ENV.csv`, a table and a figure beside them. Repeat the command to resume: runs that have a row, and
-finished runs, are not run again.
+`experiments/results/people_ENV.csv`, and a table and a figure are written beside them. Repeat the command to resume: runs that
+have a row, and finished runs, are not run again.
 """
 
 import argparse
@@ -30,7 +30,7 @@ class Circumstance(NamedTuple):
 
     Attributes:
         name: of a parameter; "" = nothing.
-        level: its value, in words.
+        level: its value, as text.
     """
 
     name: str
@@ -64,7 +64,8 @@ def table(groups: Sequence[Group]) -> str:
     for place in places:
         cells = [_cell(groups, rule, place) for rule in rules]
         rows.append((place.name.replace("_", " "), place.level.replace("_", " "), *cells))
-    note = "Mean successes (95 % interval; range below 5 seeds), and their share of those with perfect people."
+    note = "Mean successes (95 % interval; with fewer than 5 seeds, smallest to largest), and how many percent they are of the "
+    note += "same rule's with perfect people."
     return f"{text.markdown_table(rows)}\n\n{note}\n"
 
 

@@ -212,7 +212,7 @@ PARAMETERS: dict[str, Mapping[str, Field]] = {
     },
     "teach_first": {
         "teaching_time": Field(
-            "time for which humans teleoperate, all together, before they only reset",
+            "time for which humans act on moving robots, all together, before they only reset",
             "human timesteps",
             low=1,
             default=5000.0,

@@ -393,13 +393,15 @@ def fit_humans(arguments: argparse.Namespace) -> None:
 
 
 def lead(arguments: argparse.Namespace) -> None:
-    """Compare rules at equal human time: run what is missing of new ones, then show all that is stored."""
+    """Compare rules at equal human time: run those that are named, then write the table and the figure of all stored runs."""
     from fleetjax.io import leaderboard
 
     with _refusing():
         store = leaderboard.Store(arguments.results)
         if not store.runs:
-            raise ValueError(f"{store.rows} does not exist; run this in a clone of the repository, or give --results DIR")
+            raise ValueError(
+                f"there are no stored runs in {store.rows}; run this in a clone of the repository, or give --results DIR"
+            )
         if bool(arguments.algorithms) != (arguments.action == "add"):
             raise ValueError("name rules after `fleetjax leaderboard add`, and none after `fleetjax leaderboard show`")
         asked = (arguments.environments, arguments.budgets, arguments.seeds, arguments.output)

@@ -86,8 +86,8 @@ pre-trained fleet runs, and its humans help."""
 _LEADERBOARD_ABOUT = """Compare rules for help at equal human time. The stored runs are in the repository: start this in a clone
 of it, or name their folder with --results.
 
-show: make the table and the figure from the stored runs. add: calibrate each RULE so that it spends every budget, run it, store
-its runs, and show. The same command resumes."""
+show: write the table and the figure of all stored runs, and print where. add: for each budget, find the threshold at which RULE
+spends it, run the rule, and store its runs; then do what show does. If add is interrupted, repeat the command."""
 _HUMANS_ABOUT = """Print how long people took to act on robots in a console session, how much longer if they came from another
 robot, and how often they were away: a table by seat, and the flags of `fleetjax run` that fit all of them together. Noise,
 mistakes and delays are not fitted."""
@@ -185,9 +185,9 @@ def _add_leaderboard(commands: Any) -> None:
     usage += "       fleetjax leaderboard show"
     about = {"help": "compare rules for help at equal human time", "description": _LEADERBOARD_ABOUT}
     board = commands.add_parser("leaderboard", usage=usage, **about)
-    board.add_argument("action", choices=("add", "show"), help="run rules and show the table, or only show it")
+    board.add_argument("action", choices=("add", "show"), help="add: run rules, then show; show: write table and figure")
     board.add_argument("algorithms", metavar="RULE", nargs="*", help="registered algorithm")
-    where = "separated by commas [default: navigation,block_push]"
+    where = "environments, separated by commas [default: navigation,block_push]"
     board.add_argument("--environments", metavar="ENV,...", type=listed(str), default=["navigation", "block_push"], help=where)
     much = "human timesteps, separated by commas [default: those of the environment]"
     board.add_argument("--budgets", metavar="H,...", type=listed(integer), default=(), help=much)

@@ -1,8 +1,8 @@
 """Rules for help at equal human time: each is calibrated, run, and compared with the others from stored rows.
 
 A rule's threshold is calibrated on seed 100, so that a run spends a budget of human timesteps. Then it runs with seeds
-0, 1, ... A rule without a threshold spends what it spends. No rule has an initial period, and extra demonstrations count as
-human time.
+0, 1, ... The human time of a rule without a threshold is not controlled. No rule has an initial period, and extra
+demonstrations count as human time.
 """
 
 import json
@@ -27,10 +27,10 @@ BUDGETS = {  # human timesteps
     "anymal": (10_000,),
     "allegro_hand": (10_000,),
 }
-FIXED = ("constraint", "constraint_trained", "longest_waiting")  # whose human time no threshold changes
-CALIBRATED_ON = 100  # seed
-MOST = 8  # runs of a search
-TOLERANCE = 0.05
+FIXED = ("constraint", "constraint_trained", "longest_waiting")  # rules without a threshold
+CALIBRATED_ON = 100  # seed of calibrations
+MOST = 8  # runs in a calibration
+TOLERANCE = 0.05  # relative difference from the budget
 
 
 class Entry(NamedTuple):
@@ -68,14 +68,14 @@ class Entry(NamedTuple):
 
 
 class Place(NamedTuple):
-    """What was calibrated.
+    """The result of a calibration.
 
     Attributes:
         environment: its name.
         algorithm: its name.
         budget: human timesteps that were wanted.
         field: the parameter that was searched; "" = the algorithm has none.
-        value: the nearest that was found.
+        value: that spends nearest to the budget.
         spent: human timesteps with it on the calibration's seed.
         solved: whether these are within 5 % of the budget.
     """
@@ -170,7 +170,7 @@ def _obstacle(environment: str, algorithm: str) -> str:
 
 
 def compete(store: Store, entry: Entry) -> None:
-    """Calibrate a rule and run it, as far as that is not stored."""
+    """Calibrate a rule and run it, but for what is stored."""
     config, place = entry.config, store.find(*entry[:3])
     if entry.algorithm in FIXED:
         place = Place(*entry[:3], "", 0.0, 0.0, solved=False)

@@ -1,4 +1,4 @@
-"""Help early: what the policy learns from an action pays for the rest of the run."""
+"""Help early: what the policy learns from an action helps until the end of the run."""
 
 import jax
 import jax.numpy as jnp
@@ -10,12 +10,12 @@ from fleetjax.priority.ranks import lexicographic
 
 
 def teach_first(config) -> Priority:
-    """Random moving robots until humans have acted `teaching_time` times in all, then robots in violation only.
+    """Help random moving robots until humans have acted for `teaching_time` timesteps in all; after that, only reset robots.
 
     Violations come last in the first half of that time: a robot would soon fall again under a policy that has yet to learn. In
     the second half they come first.
 
-    Reference: fleetjax's own rule; docs/beat_cur.md has what was tried, and figures.
+    Reference: fleetjax's own rule; docs/beat_cur.md compares it with others.
     """
 
     def score(signals, taught, key):

@@ -78,6 +78,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=100)
     parser.add_argument("--until", type=float, help="T [default: one for each environment]")
     args, given = scripts.parse(parser)
+    if unknown := [name for name in args.variants if name not in VARIANTS]:
+        parser.error(f"unknown variants: {', '.join(unknown)}; choose from {', '.join(VARIANTS)}")
     for name in args.variants:
         variant = VARIANTS[name]
         own = {"help_until": Field("timestep at which the teaching ends", default=0.0)}
@@ -88,7 +90,7 @@ def main() -> None:
     print("| environment | variant | successes | violations | human time | idle time |\n|---|---|---:|---:|---:|---:|")
     for environment in args.environments:
         for name in args.variants:
-            settings = {"initial_period": 0, "help_until": args.until or UNTIL[environment]} | given
+            settings = {"initial_period": 0, "help_until": UNTIL[environment] if args.until is None else args.until} | given
             config = fleetjax.make_config(environment, name, **settings)
             totals = jax.tree.map(lambda x: int(x.sum()), fleetjax.run(config, jax.random.key(args.seed)).metrics)
             counts = (totals.successes, totals.violations, totals.human_steps, totals.idle)

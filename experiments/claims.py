@@ -281,14 +281,9 @@ def cells(claim: Claim, verdict: str, difference: Difference | None) -> tuple[st
     words = f"{NAMES[claim.place]}: {claim.words}" if claim.place else claim.words
     if difference is None:
         return words, verdict, "", "", ""
-    bounds = f"{number(difference.low)} to {number(difference.high)}"
+    bounds = f"{text.number(difference.low)} to {text.number(difference.high)}"
     shown = bounds if difference.seeds >= statistics.MIN_SEEDS else f"({bounds})"
-    return words, verdict, difference.name, f"{number(difference.mean)}, {shown}", str(difference.seeds)
-
-
-def number(x: float) -> str:
-    """Return a number with three digits, or all of those before the point."""
-    return f"{x:,.0f}" if abs(x) >= 100 else f"{x:.3g}"
+    return words, verdict, difference.name, f"{text.number(difference.mean)}, {shown}", str(difference.seeds)
 
 
 def verdicts(study: Study) -> str:

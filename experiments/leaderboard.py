@@ -11,8 +11,7 @@ stored, or finished below --output, are not run again.
 import argparse
 from pathlib import Path
 
-from fleetjax import list_algorithms
-from fleetjax.io import leaderboard, scripts
+from fleetjax.io import files, leaderboard, scripts
 
 ORDER = (  # in which they are run
     *(
@@ -46,17 +45,19 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=results, help="folder for rows, table and figure")
     parser.add_argument("--rows-only", action="store_true", help="no runs; only table and figure")
     args = parser.parse_args()
-    unknown = set(args.algorithms or ()) - set(list_algorithms())
-    if unknown:
-        parser.error(f"unknown algorithms: {', '.join(sorted(unknown))}; choose from {', '.join(list_algorithms())}")
     args.results.mkdir(parents=True, exist_ok=True)
-    store = leaderboard.Store(args.results)
-    if not args.rows_only:
-        asked = (args.environments, args.budgets or (), args.seeds, args.output)
-        for entry in leaderboard.entries(args.algorithms or ORDER, *asked):
-            leaderboard.compete(store, entry)
-    if store.runs:
-        print(leaderboard.publish(store))
+    with files.lock(args.results):
+        store = leaderboard.Store(args.results)
+        if not args.rows_only:
+            asked = (args.environments, args.budgets or (), args.seeds, args.output)
+            try:
+                entries = leaderboard.entries(args.algorithms or ORDER, *asked)
+            except ValueError as error:
+                parser.error(str(error))
+            for entry in entries:
+                leaderboard.compete(store, entry)
+        if store.runs:
+            print(leaderboard.publish(store))
 
 
 if __name__ == "__main__":

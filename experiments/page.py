@@ -39,7 +39,7 @@ PUBLISHED = {  # successes of the trained policies (paper, Appendix); Fleet-TD i
         "expert": 21609,
     },
 }
-PAGES = ("results", "beat_cur", "leaderboard", "humans")
+PAGES = ("results", "beat_cur", "leaderboard")
 COLUMNS = {"successes": "successes", "violations": "violations", "human_steps": "human time", "rohe": "ROHE"}
 
 
@@ -58,8 +58,8 @@ def readable(label: str) -> str:
 def mean(one: Group, metric: str, *, spread: bool = False) -> str:
     """Return the mean of a metric over seeds, with the smallest and the largest if asked for."""
     found = np.array(list(comparing.values_by_seed(one, metric).values()))
-    shown = claims.number(found.mean())
-    return f"{shown} ({claims.number(found.min())} to {claims.number(found.max())})" if spread and len(found) > 1 else shown
+    shown = text.number(found.mean())
+    return f"{shown} ({text.number(found.min())} to {text.number(found.max())})" if spread and len(found) > 1 else shown
 
 
 def achieved(found: list[Group], alone: Mapping[str, Group]) -> str:
@@ -80,7 +80,7 @@ def achieved(found: list[Group], alone: Mapping[str, Group]) -> str:
             paper_value = PUBLISHED.get(place, {}).get(algorithm)
             fewer = f" ({len(policy.runs)} of {len(one.runs)} seeds)" if policy and len(policy.runs) < len(one.runs) else ""
             cells += [mean(policy, "successes") + fewer, mean(policy, "violations")] if policy else ["", ""]
-            cells += ["" if paper_value is None else claims.number(paper_value)]
+            cells += ["" if paper_value is None else text.number(paper_value)]
         table.append(tuple(cells))
     return text.markdown_table(table)
 
@@ -117,7 +117,10 @@ def against_cur(found: list[Group]) -> str:
     """Return a table of Teach First and Random beside C.U.R.; ratios are of the successes over the seeds that both have."""
     table: list[tuple[str, ...]] = [("", "seeds", "successes", "times C.U.R.'s", "violations", "human time", "idle time")]
     for place in dict.fromkeys(one.config.environment for one in found):
-        here = {one.config.algorithm: one for one in found if one.config.environment == place}
+        here: dict[str, Group] = {}
+        for one in found:
+            if one.config.environment == place:
+                here.setdefault(one.config.algorithm, one)  # those of the study come before older ones
         reference = comparing.values_by_seed(here["cur"], "successes")
         for algorithm in ("cur", "random", "teach_first"):
             if algorithm in here:
@@ -127,7 +130,7 @@ def against_cur(found: list[Group]) -> str:
                 ratio = sum(values[seed] for seed in shared) / sum(reference[seed] for seed in shared)
                 low, high = statistics.mean_bounds(np.array(list(values.values())))
                 cells = [f"{claims.NAMES[place]}, {text.label(algorithm)}", str(len(values))]
-                cells += [f"{mean(one, 'successes')} ({claims.number(float(low))} to {claims.number(float(high))})"]
+                cells += [f"{mean(one, 'successes')} ({text.number(float(low))} to {text.number(float(high))})"]
                 cells += ["" if algorithm == "cur" else f"{ratio:.2f}"]
                 table.append((*cells, *(mean(one, metric) for metric in ("violations", "human_steps", "idle"))))
     return text.markdown_table(table)
@@ -168,9 +171,9 @@ def main() -> None:
         files.expect(bool(names), f"{path} has no table; a table stands from <!-- NAME --> to <!-- end -->")
         for name in names:
             files.expect(name in known, f"{path} has an unknown table {name!r}; choose from {', '.join(known)}")
-            page = re.sub(
-                rf"(<!-- {name} -->\n)(?s:.*?)(<!-- end -->)", lambda m, n=name: f"{m[1]}\n{known[n]()}\n\n{m[2]}", page
-            )
+            here = rf"(<!-- {name} -->\n)(?s:(?!<!--).)*(<!-- end -->)"
+            page, count = re.subn(here, lambda m, n=name: f"{m[1]}\n{known[n]()}\n\n{m[2]}", page)
+            files.expect(count == 1, f"{path}: table {name!r} must stand there once, from <!-- {name} --> to <!-- end -->")
         files.write(path, page.encode())
         print(path)
 

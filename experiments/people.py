@@ -19,7 +19,7 @@ import paper
 from fleetjax import statistics
 from fleetjax.config import Config, get_value
 from fleetjax.field import FIELDS, OF_HUMANS
-from fleetjax.io import comparing, figure, files, scripts, text
+from fleetjax.io import comparing, figure, files, scripts, sweep, text
 from fleetjax.io.outcomes import Group, group
 
 ENVIRONMENTS = ("navigation", "humanoid")
@@ -80,8 +80,8 @@ def _cell(groups: Sequence[Group], rule: str, place: Circumstance) -> str:
     if not len(values):
         return ""
     low, high = statistics.mean_bounds(values)
-    share = f", {100 * values.mean() / perfect.mean():.0f} %" if place.name and len(perfect) else ""
-    return f"{text.count(values.mean())} ({text.count(float(low))} to {text.count(float(high))}){share}"
+    share = f", {100 * values.mean() / perfect.mean():.0f} %" if place.name and perfect.sum() else ""
+    return f"{text.number(float(values.mean()))} ({text.number(float(low))} to {text.number(float(high))}){share}"
 
 
 def draw(groups: Sequence[Group]) -> bytes:
@@ -111,11 +111,13 @@ def _panel(ax: Any, groups: Sequence[Group], rules: Sequence[str], places: Seque
     """Draw a panel: perfect people at the left, then one level after the other."""
     for rule in rules:
         found = [(i, values) for i, place in enumerate(places) if len(values := _find(groups, rule, place))]
+        if not found:
+            continue
         middle = np.array([values.mean() for _, values in found])
         low, high = np.array([statistics.mean_bounds(values) for _, values in found]).T
         error = np.stack([middle - low, high - middle])
         ax.errorbar([i for i, _ in found], middle, error, label=text.label(rule), marker="o", markersize=3, capsize=2)
-    ticks = ["perfect", *(place.level.split(",")[0].replace("_", "\n") for place in places[1:])]
+    ticks = [place.level.split(",")[0].replace("_", "\n").removesuffix(" people") for place in places]
     ax.set_xticks(range(len(places)), ticks)
 
 
@@ -125,9 +127,10 @@ class Part(paper.Part):
     def show(self) -> None:
         """Write the table and the figure of the stored rows."""
         groups = group(list(self.rows().values()))
-        for suffix, content in {".md": table(groups).encode(), ".png": draw(groups)}.items():
-            files.write(self.path.with_suffix(suffix), content)
-            print(self.path.with_suffix(suffix))
+        files.write(self.path.with_suffix(".md"), table(groups).encode())
+        print(self.path.with_suffix(".md"))
+        if any(circumstance(one.config) != PERFECT for one in groups):
+            files.write(self.path.with_suffix(".png"), draw(groups))
 
 
 def main() -> None:
@@ -137,6 +140,7 @@ def main() -> None:
     paper.add_options(parser, output=Path("runs/people"))
     args = parser.parse_args()
     args.results.mkdir(parents=True, exist_ok=True)
+    sweep.leave_gpus_to_workers()
     for part in [Part(f"people_{name}", args) for name in args.environments]:
         if not args.rows_only:
             part.run()

@@ -14,9 +14,15 @@ class Scale(NamedTuple):
 
     Attributes:
         bounded: whether it lies between 0 and 1.
+        least: smallest value that is allowed.
+        most: largest value that is allowed.
+        rises: whether what is measured mostly rises with the value; it falls with a threshold.
     """
 
     bounded: bool
+    least: float = 0.0
+    most: float = math.inf
+    rises: bool = False
 
     def inward(self, value: float) -> float:
         """Return the scaled parameter."""
@@ -30,7 +36,8 @@ class Scale(NamedTuple):
         >>> round(scale.outward(scale.inward(0.998)), 6)
         0.998
         """
-        return 1 / (1 + math.exp(-scaled)) if self.bounded else math.exp(scaled)
+        value = 1 / (1 + math.exp(-scaled)) if self.bounded else math.exp(scaled)
+        return min(max(value, self.least), self.most)
 
 
 def solve(
@@ -38,8 +45,8 @@ def solve(
 ) -> list[tuple[float, float]]:
     """Measure at one value after another, until one gives what is wanted or no measurement is left.
 
-    From `start` the search takes growing steps both ways, towards smaller numbers first where too much was measured, until two
-    neighbours lie on both sides of what is wanted. Between them it interpolates.
+    From `start` the search takes growing steps both ways, first to where the number should be nearer, until two neighbours lie
+    on both sides of what is wanted. Between them it interpolates.
 
     Args:
         measure: `value -> number`, at least 0.
@@ -64,7 +71,7 @@ def solve(
             break
         following = _between(tried, wanted)
         if following is None:
-            following = _beyond(tried, wanted)
+            following = _beyond(tried, wanted, scale)
         if following is None:
             break
         scaled = following
@@ -85,12 +92,12 @@ def _between(tried: dict[float, float], wanted: float) -> float | None:
     return a + (b - a) * min(max(share, 0.15), 0.85)  # else one end could stay for ever
 
 
-def _beyond(tried: dict[float, float], wanted: float) -> float | None:
+def _beyond(tried: dict[float, float], wanted: float, scale: Scale) -> float | None:
     """Return where to measure outside of all values so far, now on one side, now on the other; None if both are exhausted."""
     places = sorted(tried)
     step = FIRST_STEP * 1.5 ** (len(places) - 1)
     up, down = places[-1] + step, places[0] - step
-    upward = tried[places[0]] > wanted  # what is asked for mostly falls with a threshold
+    upward = (tried[places[-1 if scale.rises else 0]] > wanted) != scale.rises
     if len(places) >= 3 and abs(tried[places[0 if upward else -1]] - wanted) < abs(tried[places[-1 if upward else 0]] - wanted):
         upward = not upward  # the other end is nearer
     order = (up, down) if upward else (down, up)

@@ -1,5 +1,6 @@
 """The leaderboard: its rows, its table, its command."""
 
+import functools
 import shutil
 
 import pytest
@@ -7,7 +8,7 @@ from commands import make_metrics, refused
 
 import fleetjax
 from fleetjax import cli
-from fleetjax.io import leaderboard, sources
+from fleetjax.io import leaderboard, resumable, sources
 
 
 @pytest.fixture
@@ -37,9 +38,9 @@ def test_the_table_has_the_most_successes_first_and_stars_for_other_human_times(
     assert rows[2] == "Random"
     assert sorted(rows[3:]) == ["C.U.R.", "Constraint *"]
     total = {seed: int(make_metrics(seed, 40).successes.sum()) for seed in range(3)}
-    low, high, mean = min(total.values()), max(total.values()), sum(total.values()) // 3
+    low, high, mean = min(total.values()), max(total.values()), sum(total.values()) / 3
     line = next(line for line in (stored / "leaderboard.md").read_text().splitlines() if "| Random" in line)
-    assert line.split("|")[-2].strip() == f"{mean} ({low} to {high})"  # more than C.U.R.: as many as that has
+    assert line.split("|")[-2].strip() == f"{mean:.3g} ({low} to {high})"  # more than C.U.R.: as many as that has
     assert (stored / "leaderboard.png").stat().st_size > 10_000
 
 
@@ -54,8 +55,9 @@ def test_stored_runs_and_calibrations_are_read_again(stored):
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        (("show", "cur"), "name rules after `fleetjax leaderboard add`"),
-        (("add",), "name rules after `fleetjax leaderboard add`"),
+        (("show", "cur"), "unexpected argument 'cur'"),
+        (("add",), "the following arguments are required: RULE"),
+        ((), "the following arguments are required: ACTION"),
         (("add", "curr"), "algorithm = 'curr' is unknown; the closest are"),
         (("add", "cur", "--environments", "mars"), "environment = 'mars' has no leaderboard; choose from navigation"),
         (("add", "cur", "--seeds", "0"), "seeds = 0 must be at least 1"),
@@ -65,8 +67,67 @@ def test_stored_runs_and_calibrations_are_read_again(stored):
 )
 def test_what_cannot_be_compared_is_refused(arguments, reason, stored, capsys):
     before = {path.name: path.read_bytes() for path in stored.iterdir()}
-    assert reason in refused(capsys, "leaderboard", *arguments, "--results", stored)
+    assert reason in refused(capsys, "leaderboard", *arguments, *(["--results", stored] if arguments else []))
     assert {path.name: path.read_bytes() for path in stored.iterdir()} == before
+
+
+def test_rules_that_need_goals_are_left_out_where_there_are_none(tmp_path, capsys):
+    found = leaderboard.entries(["thrifty_dagger", "cur"], ["humanoid", "navigation"], (), 2, tmp_path)
+    pairs = {(entry.environment, entry.algorithm) for entry in found}
+    assert pairs == {("navigation", "thrifty_dagger"), ("humanoid", "cur"), ("navigation", "cur")}
+    assert "left out: humanoid: algorithm = 'thrifty_dagger' needs a goal" in capsys.readouterr().err
+
+
+def test_a_removed_rule_is_forgotten(stored):
+    assert cli.main(["leaderboard", "remove", "random", "--results", str(stored)]) == 0
+    again = leaderboard.Store(stored)
+    assert {run.config.algorithm for run in again.runs} == {"cur", "constraint"}
+    assert "Random" not in (stored / "leaderboard.md").read_text()
+
+
+@pytest.mark.slow
+def test_an_interrupted_rule_goes_on_where_it_stopped(tmp_path, monkeypatch):
+    small = {
+        "num_robots": 6,
+        "num_humans": 3,
+        "num_steps": 60,
+        "hidden_sizes": (8,),
+        "batch_size": 16,
+        "num_demonstrations": 40,
+    }
+    monkeypatch.setattr(leaderboard, "make_config", functools.partial(fleetjax.make_config, **small, pretraining_steps=5))
+    complete, done = resumable.complete, []
+
+    def interrupted(run, **options):
+        if len(done) == stop:
+            raise KeyboardInterrupt
+        done.append(run.folder.name)
+        return complete(run, **options)
+
+    monkeypatch.setattr(resumable, "complete", interrupted)
+    (tmp_path / "results").mkdir()
+    entry, stop = leaderboard.entries(["teach_first"], ["navigation"], (90,), 3, tmp_path / "runs")[0], 10**9
+    leaderboard.compete(leaderboard.Store(tmp_path / "results"), entry)
+    whole, number = leaderboard.Store(tmp_path / "results"), len(done)
+    place = whole.places[0]
+    assert place.solved
+    assert abs(place.spent - 90) <= 0.05 * 90
+    assert [run.seed for run in whole.runs] == [0, 1, 2]
+
+    shutil.rmtree(tmp_path / "results")
+    shutil.rmtree(tmp_path / "runs")
+    (tmp_path / "results").mkdir()
+    done.clear()
+    stop = number - 1  # before the last seed
+    with pytest.raises(KeyboardInterrupt):
+        leaderboard.compete(leaderboard.Store(tmp_path / "results"), entry)
+    assert [run.seed for run in leaderboard.Store(tmp_path / "results").runs] == [0, 1]
+    stop = 10**9
+    leaderboard.compete(leaderboard.Store(tmp_path / "results"), entry)
+    assert len(done) == number
+    again = leaderboard.Store(tmp_path / "results")
+    assert again.places == whole.places
+    assert [run.metrics.successes.tolist() for run in again.runs] == [run.metrics.successes.tolist() for run in whole.runs]
 
 
 def test_without_stored_runs_it_says_where_they_are(tmp_path, capsys):

@@ -89,7 +89,8 @@ def check(request: Request) -> None:
 def calibrate(request: Request) -> Calibration:
     """Run until the value is found; runs that `output` holds already are not repeated."""
     field = all_fields(request.config.algorithm)[request.field]
-    scale = Scale(bounded=field.high == 1)
+    most = math.inf if field.high is None else field.high
+    scale = Scale(field.high == 1, field.low or 0.0, most, rises=request.field.endswith(("_rate", "_time")))
     first, *others = request.seeds
     start = float(get_value(request.config, request.field))
     tried = solve(

@@ -402,13 +402,16 @@ def lead(arguments: argparse.Namespace) -> None:
             raise ValueError(
                 f"there are no stored runs in {store.rows}; run this in a clone of the repository, or give --results DIR"
             )
-        if bool(arguments.algorithms) != (arguments.action == "add"):
-            raise ValueError("name rules after `fleetjax leaderboard add`, and none after `fleetjax leaderboard show`")
-        asked = (arguments.environments, arguments.budgets, arguments.seeds, arguments.output)
-        entries = leaderboard.entries(arguments.algorithms, *asked)
-    for entry in entries:
-        leaderboard.compete(store, entry)
-    print(leaderboard.publish(store))
+        entries = []
+        if arguments.action == "add":
+            asked = (arguments.environments, arguments.budgets, arguments.seeds, arguments.output)
+            entries = leaderboard.entries(arguments.algorithms, *asked)
+        with files.lock(arguments.results):
+            if arguments.action == "remove":
+                store.remove(arguments.algorithms)
+            for entry in entries:
+                leaderboard.compete(store, entry)
+            print(leaderboard.publish(store))
 
 
 COMMANDS: Mapping[str, Callable[[argparse.Namespace], None]] = {

@@ -86,8 +86,8 @@ pre-trained fleet runs, and its humans help."""
 _LEADERBOARD_ABOUT = """Compare rules for help at equal human time. The stored runs are in the repository: start this in a clone
 of it, or name their folder with --results.
 
-show: write the table and the figure of all stored runs, and print where. add: for each budget, find the threshold at which RULE
-spends it, run the rule, and store its runs; then do what show does. If add is interrupted, repeat the command."""
+add: for each budget, find the threshold at which RULE spends it, run the rule, and store its runs. If add is interrupted,
+repeat the command. remove: forget what is stored of a rule, as after a change of its code. Each of them ends as show does."""
 _HUMANS_ABOUT = """Print how long people took to act on robots in a console session, how much longer if they came from another
 robot, and how often they were away: a table by seat, and the flags of `fleetjax run` that fit all of them together. Noise,
 mistakes and delays are not fitted."""
@@ -181,21 +181,25 @@ def _add_humans(commands: Any) -> None:
 
 
 def _add_leaderboard(commands: Any) -> None:
-    usage = "fleetjax leaderboard add RULE... [--environments ENV,...] [--budgets H,...] [--seeds N]\n"
-    usage += "       fleetjax leaderboard show"
     about = {"help": "compare rules for help at equal human time", "description": _LEADERBOARD_ABOUT}
-    board = commands.add_parser("leaderboard", usage=usage, **about)
-    board.add_argument("action", choices=("add", "show"), help="add: run rules, then show; show: write table and figure")
-    board.add_argument("algorithms", metavar="RULE", nargs="*", help="registered algorithm")
+    actions = commands.add_parser("leaderboard", **about).add_subparsers(dest="action", metavar="ACTION", required=True)
+    add = actions.add_parser("add", help="run rules and store their runs, then show")
+    remove = actions.add_parser("remove", help="forget the stored runs of rules, then show")
+    for one in (add, remove):
+        one.add_argument("algorithms", metavar="RULE", nargs="+", help="registered algorithm")
     where = "environments, separated by commas [default: navigation,block_push]"
-    board.add_argument("--environments", metavar="ENV,...", type=listed(str), default=["navigation", "block_push"], help=where)
+    add.add_argument("--environments", metavar="ENV,...", type=listed(str), default=["navigation", "block_push"], help=where)
     much = "human timesteps, separated by commas [default: those of the environment]"
-    board.add_argument("--budgets", metavar="H,...", type=listed(integer), default=(), help=much)
-    board.add_argument("--seeds", metavar="N", type=integer, default=5, help="runs of each rule at each budget [default: 5]")
-    stored = Path("experiments/results")
-    board.add_argument("--results", metavar="DIR", type=Path, default=stored, help=f"folder of stored runs [default: {stored}]")
+    add.add_argument("--budgets", metavar="H,...", type=listed(integer), default=(), help=much)
+    add.add_argument("--seeds", metavar="N", type=integer, default=5, help="runs of each rule at each budget [default: 5]")
     runs = Path("runs/leaderboard")
-    board.add_argument("--output", metavar="DIR", type=Path, default=runs, help=f"folder of run folders [default: {runs}]")
+    add.add_argument("--output", metavar="DIR", type=Path, default=runs, help=f"folder of run folders [default: {runs}]")
+    show = actions.add_parser("show", help="write the table and the figure of all stored runs, and print where")
+    stored = Path("experiments/results")
+    for one in (add, remove, show):
+        one.add_argument(
+            "--results", metavar="DIR", type=Path, default=stored, help=f"folder of stored runs [default: {stored}]"
+        )
 
 
 def _add_compare(commands: Any) -> None:

@@ -17,6 +17,7 @@ from fleetjax.checks import check_run
 from fleetjax.config import Config, get_value, make_config
 from fleetjax.io import calibration, comparing, files, folder, resumable, rows, text
 from fleetjax.io.outcomes import Group, Outcome, group
+from fleetjax.io.progress import say
 from fleetjax.io.sources import collect
 from fleetjax.priority import get_algorithm
 
@@ -107,13 +108,22 @@ class Store:
         wanted = (environment, algorithm, budget)
         return next((place for place in self.places if place[:3] == wanted), None)
 
-    def add(self, place: Place, found: list[Outcome]) -> None:
+    def add(self, place: Place, found: Sequence[Outcome] = ()) -> None:
         """Store a calibration, and runs that were not stored."""
         self.places = [*(other for other in self.places if other[:3] != place[:3]), place]
         self.runs += found
-        files.write_json(self.table, {"calibrations": [one._asdict() for one in self.places]})
+        self._write()
+
+    def remove(self, algorithms: Sequence[str]) -> None:
+        """Forget all that is stored of these rules."""
+        self.places = [place for place in self.places if place.algorithm not in algorithms]
+        self.runs = [run for run in self.runs if run.config.algorithm not in algorithms]
+        self._write()
+
+    def _write(self) -> None:
         if self.runs:
             files.write(self.rows, rows.write(self.runs))
+        files.write_json(self.table, {"calibrations": [one._asdict() for one in self.places]})
 
     def group_of(self, place: Place) -> Group | None:
         """Return the runs at a calibrated value, as one group."""
@@ -121,7 +131,7 @@ class Store:
         same = [
             run for run in here if not place.field or np.float32(get_value(run.config, place.field)) == np.float32(place.value)
         ]
-        return group(same)[0] if same else None
+        return group(same)[-1] if same else None  # of different settings, the newest
 
 
 def entries(
@@ -137,26 +147,28 @@ def entries(
         output: folder of all run folders.
 
     Raises:
-        ValueError: if a name is unknown, a number too small, or a rule can run in none of these environments.
+        ValueError: if a name is unknown, a number too small, or no rule can run in any of these environments.
     """
     for environment in environments:
         if environment not in BUDGETS:
             raise ValueError(f"environment = {environment!r} has no leaderboard; choose from {', '.join(BUDGETS)}")
     if seeds < 1:
         raise ValueError(f"seeds = {seeds} must be at least 1")
-    found = []
+    found, obstacles = [], []
     for algorithm in algorithms:
         get_algorithm(algorithm)
-        errors = {environment: error for environment in environments if (error := _obstacle(environment, algorithm))}
-        if len(errors) == len(environments):
-            raise ValueError(next(iter(errors.values())))
         for environment in environments:
-            if environment not in errors:
-                asked = budgets or BUDGETS[environment]
-                found += [Entry(environment, algorithm, budget, seeds, output) for budget in asked]
+            obstacle = _obstacle(environment, algorithm)
+            if obstacle:
+                obstacles.append(f"{environment}: {obstacle}")
+                continue
+            found += [Entry(environment, algorithm, budget, seeds, output) for budget in budgets or BUDGETS[environment]]
+    if not found:
+        raise ValueError("; ".join(obstacles))
     for entry in found:
-        if entry.algorithm not in FIXED:
-            calibration.check(entry.request)
+        calibration.check(entry.request)
+    for obstacle in obstacles:
+        say(f"left out: {obstacle}")
     return found
 
 
@@ -170,7 +182,7 @@ def _obstacle(environment: str, algorithm: str) -> str:
 
 
 def compete(store: Store, entry: Entry) -> None:
-    """Calibrate a rule and run it, but for what is stored."""
+    """Calibrate a rule and run it, but for what is stored; store each run when it is finished."""
     config, place = entry.config, store.find(*entry[:3])
     if entry.algorithm in FIXED:
         place = Place(*entry[:3], "", 0.0, 0.0, solved=False)
@@ -179,16 +191,16 @@ def compete(store: Store, entry: Entry) -> None:
         request.output.mkdir(parents=True, exist_ok=True)
         found = calibration.calibrate(request)
         place = Place(*entry[:3], request.field, found.value, found.human_time[0], bool(found.solved))
+    store.add(place)
     name = f"{place.field}-{place.value:.6g}" if place.field else "as-it-is"
     if place.field:
         config = config.replace(**{place.field: place.value})
-    known, done = {_identity(run) for run in store.runs}, []
+    known = {_identity(run) for run in store.runs}
     for seed in range(entry.seeds):
         run = folder.Run(entry.folder / f"{name}-seed{seed}", config, seed)
         if _identity(run) not in known:
             resumable.complete(run, checkpoint_every=0)
-            done += collect(run.folder)
-    store.add(place, done)
+            store.add(place, collect(run.folder))
 
 
 def _identity(run: folder.Run | Outcome) -> str:
@@ -221,7 +233,7 @@ def _part(store: Store, places: list[Place]) -> str:
     for place, one in found:
         successes = _values(one, "successes")
         cells = [f"{text.label(place.algorithm)}{'' if place.solved else ' *'}", str(len(successes)), _interval(successes)]
-        cells += [text.count(_human_time(one)), text.count(float(np.mean(_values(one, "violations"))))]
+        cells += [text.number(_human_time(one)), text.number(float(np.mean(_values(one, "violations"))))]
         cells += [f"{np.mean(_values(one, 'rohe_with_demonstrations')):.3g}", _difference(one, reference)]
         lines.append(tuple(cells))
     return text.markdown_table(lines)
@@ -247,7 +259,7 @@ def _values(one: Group, metric: str) -> np.ndarray:
 
 def _interval(values: np.ndarray) -> str:
     low, high = statistics.mean_bounds(values)
-    return f"{text.count(float(values.mean()))} ({text.count(float(low))} to {text.count(float(high))})"
+    return f"{text.number(float(values.mean()))} ({text.number(float(low))} to {text.number(float(high))})"
 
 
 def draw(store: Store) -> bytes:
@@ -256,7 +268,7 @@ def draw(store: Store) -> bytes:
 
     from fleetjax.io import figure  # imported on demand
 
-    environments = list(dict.fromkeys(place.environment for place in store.places))
+    environments = list(dict.fromkeys(place.environment for place in store.places if store.group_of(place)))
     with figure.style():
         canvas, axes = plt.subplots(1, len(environments), figsize=(6.5 * len(environments), 5), squeeze=False)
         for ax, environment in zip(axes[0], environments, strict=True):

@@ -91,6 +91,15 @@ def count(number: float) -> str:
     return f"{int(number):,}"
 
 
+def number(value: float) -> str:
+    """Return a number with three digits, or all of those before the point.
+
+    >>> number(18201.6), number(7.5), number(-0.6)
+    ('18,202', '7.5', '-0.6')
+    """
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
 def plural(number: int, thing: str) -> str:
     """Return a number with the name of what is counted.
 

@@ -476,6 +476,7 @@ def compiled():
 
     jax.monitoring.register_event_duration_secs_listener(count)
     jax.config.update("jax_disable_most_optimizations", True)
+    jax.clear_caches()  # another file's tests, or this file's before, may have compiled the same programs
     yield seconds
     jax.config.update("jax_disable_most_optimizations", False)
     jax.monitoring.unregister_event_duration_listener(count)

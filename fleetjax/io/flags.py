@@ -312,7 +312,9 @@ def _add_calibrate(commands: Any, environment: str | None) -> None:
     calibrate.add_argument("environment", metavar="ENV", nargs="?", default=argparse.SUPPRESS, help="environment")
     wanted = "human timesteps that a run should spend, hard resets included"
     calibrate.add_argument("--human-time", metavar="X", type=number, help=wanted)
-    calibrate.add_argument("--field", metavar="NAME", help="parameter to find [default: the algorithm's threshold]")
+    calibrate.add_argument(
+        "--field", metavar="NAME", help="parameter to find [default: the algorithm's own threshold, rate or time]"
+    )
     calibrate.add_argument("--first-seed", metavar="N", type=seed, default=0, help="seed of the search [default: 0]")
     calibrate.add_argument("--seeds", metavar="N", type=integer, default=3, help="seeds in all [default: 3]")
     near = "relative difference that is near enough [default: 0.05]"

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import fleetjax
 from fleetjax.field import Field
 from fleetjax.io import scripts, text
+from fleetjax.io.lists import listed
 from fleetjax.priority import Priority, lexicographic, stateless
 
 HOLD = 50  # timesteps that a human stays with a robot in `held`
@@ -74,7 +75,7 @@ def main() -> None:
     """Run the variants that are asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     scripts.add_names(parser, "environments", tuple(UNTIL))
-    parser.add_argument("--variants", type=lambda names: names.split(","), default=[*VARIANTS], help="names [default: all]")
+    parser.add_argument("--variants", type=listed(str), default=[*VARIANTS], help="names [default: all]")
     parser.add_argument("--seed", type=int, default=100)
     parser.add_argument("--until", type=float, help="T [default: one for each environment]")
     args, given = scripts.parse(parser)

@@ -12,18 +12,11 @@ import argparse
 from pathlib import Path
 
 from fleetjax.io import files, leaderboard, scripts
+from fleetjax.io.lists import listed
 
 ORDER = (  # in which they are run
-    *(
-        "cur",
-        "random",
-        "teach_first",
-        "ensemble_dagger",
-        "round_robin",
-        "lazy_dagger",
-        "oracle_discrepancy",
-        "quantile_ensemble",
-    ),
+    *("cur", "random", "teach_first", "ensemble_dagger", "round_robin", "lazy_dagger"),
+    *("oracle_discrepancy", "quantile_ensemble"),
     *("thrifty_quantile", "conformal", "safe_dagger", "crsail", "aim", "dropout_dagger", "asa", "weighted", "whittle", "iifl"),
     *("constraint", "constraint_trained", "longest_waiting", "thrifty_dagger"),
 )
@@ -35,10 +28,10 @@ def main() -> None:
     scripts.add_names(parser, "environments", tuple(leaderboard.BUDGETS))
     parser.add_argument(
         "--algorithms",
-        type=lambda names: names.split(","),
+        type=listed(str),
         help="names, separated by commas [default: all but orders and expert]",
     )
-    parser.add_argument("--budgets", type=lambda numbers: [*map(int, numbers.split(","))], help="human timesteps")
+    parser.add_argument("--budgets", type=listed(int), help="human timesteps")
     parser.add_argument("--seeds", type=int, default=5, help="number of seeds [default: 5]")
     parser.add_argument("--output", type=Path, default=Path("runs/leaderboard"), help="folder for the run folders")
     results = Path(__file__).parent / "results"

@@ -22,8 +22,7 @@ import numpy as np
 import paper
 import people
 
-from fleetjax import statistics
-from fleetjax.io import comparing, files, leaderboard, rows, text
+from fleetjax.io import comparing, files, folder, leaderboard, rows, text
 from fleetjax.io.outcomes import Group, Outcome, group
 from fleetjax.io.study import plan
 
@@ -102,7 +101,7 @@ def missing(args: argparse.Namespace) -> str:
         table.append((name, *counts(stored, len(plans)), f"`python experiments/paper.py {name}`"))
         kind = "policy " if name == "policies" else ""  # which is not the run that trained it
         every |= {kind + key: run for key, run in stored.items()}
-        wanted |= {kind + paper.name_of(run) for run in plans}
+        wanted |= {kind + folder.name_of(run) for run in plans}
     return text.markdown_table([*table, ("all, each once", *counts(every, len(wanted)), "`python experiments/paper.py`")])
 
 
@@ -128,9 +127,8 @@ def against_cur(found: list[Group]) -> str:
                 values = comparing.values_by_seed(one, "successes")
                 shared = sorted(values.keys() & reference.keys())
                 ratio = sum(values[seed] for seed in shared) / sum(reference[seed] for seed in shared)
-                low, high = statistics.mean_bounds(np.array(list(values.values())))
                 cells = [f"{claims.NAMES[place]}, {text.label(algorithm)}", str(len(values))]
-                cells += [f"{mean(one, 'successes')} ({text.number(float(low))} to {text.number(float(high))})"]
+                cells += [comparing.interval(np.array(list(values.values())))]
                 cells += ["" if algorithm == "cur" else f"{ratio:.2f}"]
                 table.append((*cells, *(mean(one, metric) for metric in ("violations", "human_steps", "idle"))))
     return text.markdown_table(table)

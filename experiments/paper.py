@@ -33,11 +33,6 @@ METRICS = {
 }  # that are compared; those of `fleetjax compare` in other parts
 
 
-def name_of(run: folder.Run | Outcome) -> str:
-    """Return what tells a run from others."""
-    return repr(folder.identity(run.config, run.seed))
-
-
 def is_finished(run: folder.Run) -> bool:
     """Return whether the folder of a run holds all its timesteps."""
     return folder.is_run(run.folder) and folder.read_finished(folder.read_run(run.folder)) is not None
@@ -61,7 +56,7 @@ class Part:
 
     def rows(self) -> dict[str, Outcome]:
         """Return its stored runs."""
-        return {name_of(run): run for run in rows.read(self.path)} if self.path.exists() else {}
+        return {folder.name_of(run): run for run in rows.read(self.path)} if self.path.exists() else {}
 
     def store(self, runs: Iterable[Outcome]) -> None:
         """Store runs in place of those that are stored."""
@@ -74,12 +69,12 @@ class Part:
         known = own | {
             name: run for other in PARTS if other != "policies" for name, run in Part(other, self.args).rows().items()
         }
-        missing = [run for run in runs if name_of(run) not in known]
+        missing = [run for run in runs if folder.name_of(run) not in known]
         try:
             self.complete(missing)
         finally:
-            known |= {name_of(run): collect(run.folder)[0] for run in missing if is_finished(run)}
-            wanted = dict.fromkeys([*map(name_of, runs), *own])
+            known |= {folder.name_of(run): collect(run.folder)[0] for run in missing if is_finished(run)}
+            wanted = dict.fromkeys([*map(folder.name_of, runs), *own])
             self.store(known[name] for name in wanted if name in known)
 
     def complete(self, runs: list[folder.Run]) -> None:
@@ -92,7 +87,7 @@ class Part:
     def evaluate(self, trained: "Part") -> None:
         """Run the trained policies of another part, each with the seed after its own. Expert's run stands for itself."""
         known = self.rows()
-        missing = [run for run in plan(trained.study()) if name_of(run) not in known]
+        missing = [run for run in plan(trained.study()) if folder.name_of(run) not in known]
         elsewhere = [run for run in missing if not is_finished(run)]
         for run in missing:
             if run not in elsewhere:
@@ -111,7 +106,7 @@ class Part:
         if get_algorithm(run.config.algorithm).pretrains:
             policy, key = folder.read_policy(folder.read_run(run.folder)), jax.random.key(run.seed + 1)
             found = found._replace(metrics=jax.device_get(jax.jit(evaluate)(run.config, key, policy).metrics))
-        known[name_of(run)] = found
+        known[folder.name_of(run)] = found
         self.store(known.values())
         print(f"{run.folder.name}: {found.metrics.successes.sum():,} successes", flush=True)
 

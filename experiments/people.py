@@ -79,9 +79,8 @@ def _cell(groups: Sequence[Group], rule: str, place: Circumstance) -> str:
     values, perfect = (_find(groups, rule, where) for where in (place, PERFECT))
     if not len(values):
         return ""
-    low, high = statistics.mean_bounds(values)
     share = f", {100 * values.mean() / perfect.mean():.0f} %" if place.name and perfect.sum() else ""
-    return f"{text.number(float(values.mean()))} ({text.number(float(low))} to {text.number(float(high))}){share}"
+    return comparing.interval(values) + share
 
 
 def draw(groups: Sequence[Group]) -> bytes:

@@ -114,6 +114,16 @@ def _kind(seeds: int) -> str:
     return "range" if seeds < statistics.MIN_SEEDS else "interval"
 
 
+def interval(values: np.ndarray) -> str:
+    """Return the mean of values f64[S] with its 95 % interval, or their range where there are few, as text.
+
+    >>> interval(np.array([3.0, 1.0, 2.0]))
+    '2 (1 to 3)'
+    """
+    low, high = statistics.mean_bounds(values)
+    return f"{text.number(float(values.mean()))} ({text.number(float(low))} to {text.number(float(high))})"
+
+
 def values_by_seed(one: Group, metric: str) -> dict[int, float]:
     """Return what the runs of a group achieved, by seed."""
     return {seed: _value(run, metric) for seed, run in one.runs.items()}

@@ -151,6 +151,11 @@ def identity(config: Config, seed: int) -> dict[str, Any]:
     return {"config": plain.to_plain(config), "seed": seed}
 
 
+def name_of(run: Any) -> str:
+    """Return what tells a run from others, be it a `Run` or an `Outcome`, as text."""
+    return repr(identity(run.config, run.seed))
+
+
 def first_difference(asked: Run, found: Run) -> str:
     """Return how the first setting that differs differs: "num_steps = 300, but the run has 120"; "" if none does."""
     runs = (asked, found)

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fleetjax import statistics
 from fleetjax.checks import check_run
 from fleetjax.config import Config, get_value, make_config
 from fleetjax.io import calibration, comparing, files, folder, resumable, rows, text
@@ -195,16 +194,12 @@ def compete(store: Store, entry: Entry) -> None:
     name = f"{place.field}-{place.value:.6g}" if place.field else "as-it-is"
     if place.field:
         config = config.replace(**{place.field: place.value})
-    known = {_identity(run) for run in store.runs}
+    known = {folder.name_of(run) for run in store.runs}
     for seed in range(entry.seeds):
         run = folder.Run(entry.folder / f"{name}-seed{seed}", config, seed)
-        if _identity(run) not in known:
+        if folder.name_of(run) not in known:
             resumable.complete(run, checkpoint_every=0)
             store.add(place, collect(run.folder))
-
-
-def _identity(run: folder.Run | Outcome) -> str:
-    return repr(folder.identity(run.config, run.seed))
 
 
 def publish(store: Store) -> Path:
@@ -232,7 +227,11 @@ def _part(store: Store, places: list[Place]) -> str:
     lines: list[tuple[str, ...]] = [("", "seeds", "successes", "human time", "violations", "ROHE", "successes less C.U.R.'s")]
     for place, one in found:
         successes = _values(one, "successes")
-        cells = [f"{text.label(place.algorithm)}{'' if place.solved else ' *'}", str(len(successes)), _interval(successes)]
+        cells = [
+            f"{text.label(place.algorithm)}{'' if place.solved else ' *'}",
+            str(len(successes)),
+            comparing.interval(successes),
+        ]
         cells += [text.number(_human_time(one)), text.number(float(np.mean(_values(one, "violations"))))]
         cells += [f"{np.mean(_values(one, 'rohe_with_demonstrations')):.3g}", _difference(one, reference)]
         lines.append(tuple(cells))
@@ -245,7 +244,7 @@ def _difference(one: Group, reference: Group | None) -> str:
         return ""
     mine, others = (comparing.values_by_seed(each, "successes") for each in (one, reference))
     shared = sorted(mine.keys() & others.keys())
-    return _interval(np.array([mine[seed] - others[seed] for seed in shared])) if shared else ""
+    return comparing.interval(np.array([mine[seed] - others[seed] for seed in shared])) if shared else ""
 
 
 def _human_time(one: Group) -> float:
@@ -255,11 +254,6 @@ def _human_time(one: Group) -> float:
 
 def _values(one: Group, metric: str) -> np.ndarray:
     return np.array(list(comparing.values_by_seed(one, metric).values()))
-
-
-def _interval(values: np.ndarray) -> str:
-    low, high = statistics.mean_bounds(values)
-    return f"{text.number(float(values.mean()))} ({text.number(float(low))} to {text.number(float(high))})"
 
 
 def draw(store: Store) -> bytes:

@@ -256,7 +256,7 @@ def plan(study: Study) -> list[folder.Run]:
     planned = [run for block in study.blocks for run in _product(block)]
     varied = _varied(study.blocks)
     runs = [folder.Run(study.output / _name(run, varied), run.config, run.seed, study.logged) for run in planned]
-    identities = [repr(folder.identity(run.config, run.seed)) for run in runs]
+    identities = [folder.name_of(run) for run in runs]
     for same in (identities, [str(run.folder) for run in runs]):
         twice = collections.Counter(same).most_common(1)[0]
         expect(twice[1] == 1, f"{runs[same.index(twice[0])].folder.name} is in the sweep twice; omit one")

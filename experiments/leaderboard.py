@@ -11,7 +11,7 @@ stored, or finished below --output, are not run again.
 import argparse
 from pathlib import Path
 
-from fleetjax.io import files, leaderboard, scripts
+from fleetjax.io import files, leaderboard, scripts, standings
 from fleetjax.io.lists import listed
 
 ORDER = (  # in which they are run
@@ -50,7 +50,7 @@ def main() -> None:
             for entry in entries:
                 leaderboard.compete(store, entry)
         if store.runs:
-            print(leaderboard.publish(store))
+            print(standings.publish(store))
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ import numpy as np
 import paper
 import people
 
-from fleetjax.io import comparing, files, folder, leaderboard, rows, text
+from fleetjax.io import comparing, files, folder, leaderboard, rows, standings, text
 from fleetjax.io.outcomes import Group, Outcome, group
 from fleetjax.io.study import plan
 
@@ -147,7 +147,7 @@ def tables(results: Path) -> dict[str, Callable[[], str]]:
         "claims": lambda: claims.verdicts(claims.Study(results)),
         "missing": lambda: missing(every),
         "teach_first": lambda: against_cur(groups(results, "equal_budget")),
-        "leaderboard": lambda: leaderboard.table(leaderboard.Store(results)).strip(),
+        "leaderboard": lambda: standings.table(leaderboard.Store(results)).strip(),
         **{name: lambda name=name: people.table(groups(results, name)).strip() for name in imperfect},
     }
 

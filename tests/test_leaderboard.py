@@ -3,12 +3,13 @@
 import functools
 import shutil
 
+import numpy as np
 import pytest
 from commands import make_metrics, refused
 
 import fleetjax
 from fleetjax import cli
-from fleetjax.io import leaderboard, resumable, sources
+from fleetjax.io import calibration, leaderboard, resumable, sources
 
 
 @pytest.fixture
@@ -69,6 +70,36 @@ def test_what_cannot_be_compared_is_refused(arguments, reason, stored, capsys):
     before = {path.name: path.read_bytes() for path in stored.iterdir()}
     assert reason in refused(capsys, "leaderboard", *arguments, *(["--results", stored] if arguments else []))
     assert {path.name: path.read_bytes() for path in stored.iterdir()} == before
+
+
+def test_rules_with_two_thresholds_have_both_tuned(tmp_path, monkeypatch):
+    """Of the risk thresholds at which a budget is met, the one with the most successes runs; if none is, the nearest."""
+    (entry,) = leaderboard.entries(["cur"], ["navigation"], (5000,), 2, tmp_path)
+    (other,) = leaderboard.entries(["thrifty_dagger"], ["navigation"], (5000,), 2, tmp_path)
+    assert tuple(entry.requests) == leaderboard.RISK_THRESHOLDS
+    assert all(request.config.risk_threshold == risk for risk, request in entry.requests.items())
+    assert len({request.output for request in entry.requests.values()}) == len(entry.requests)
+    assert tuple(other.requests) == (None,)
+    spends, successes = {0.5: 9000.0, 0.8: 5100.0, 0.95: 4900.0}, {0.5: 90, 0.8: 20, 0.95: 10}
+
+    def calibrate(request):
+        spent = spends[round(float(request.config.risk_threshold), 2)]
+        solved = abs(spent - request.human_time) <= 0.05 * request.human_time
+        return calibration.Calibration(0.1, (spent,), 0.0, solved, [(0.1, spent)])
+
+    def collect(path):
+        risk = float(path.parent.name.removeprefix("risk_threshold-"))
+        metrics = make_metrics(0, 40)
+        metrics = metrics._replace(successes=np.full(1, successes[risk]))
+        return sources.collect([(entry.config, 100, metrics)])
+
+    monkeypatch.setattr(calibration, "calibrate", calibrate)
+    monkeypatch.setattr(leaderboard, "collect", collect)
+    place = leaderboard.tune(entry)
+    assert place.solved
+    assert place.settings == {"uncertainty_threshold": 0.1, "risk_threshold": 0.8}
+    place = leaderboard.tune(entry._replace(budget=8000))
+    assert (place.solved, place.spent, place.risk_threshold) == (False, 9000.0, 0.5)
 
 
 def test_rules_that_need_goals_are_left_out_where_there_are_none(tmp_path, capsys):

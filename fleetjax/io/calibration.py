@@ -37,6 +37,12 @@ class Request(NamedTuple):
     output: Path
     checkpoint_every: int = 0
 
+    def run(self, value: float, seed: int) -> folder.Run:
+        """Return a run with this value of the field."""
+        value = float(np.float32(value))
+        path = self.output / f"{self.field}-{value:.6g}-seed{seed}"
+        return folder.Run(path, self.config.replace(**{self.field: value}), seed)
+
 
 class Calibration(NamedTuple):
     """What was found.
@@ -119,10 +125,7 @@ def calibrate(request: Request) -> Calibration:
 
 def _human_time(request: Request, value: float, seed: int) -> float:
     """Return the human timesteps of a run with this value."""
-    value = float(np.float32(value))
-    path = request.output / f"{request.field}-{value:.6g}-seed{seed}"
-    run = folder.Run(path, request.config.replace(**{request.field: value}), seed)
-    metrics = resumable.complete(run, checkpoint_every=request.checkpoint_every)
+    metrics = resumable.complete(request.run(value, seed), checkpoint_every=request.checkpoint_every)
     spent = float(np.sum(metrics.human_steps, dtype=float))
     say(f"{request.field} = {value:.6g}, seed {seed}: {text.count(spent)} human timesteps")
     return spent

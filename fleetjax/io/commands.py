@@ -394,7 +394,7 @@ def fit_humans(arguments: argparse.Namespace) -> None:
 
 def lead(arguments: argparse.Namespace) -> None:
     """Compare rules at equal human time: run those that are named, then write the table and the figure of all stored runs."""
-    from fleetjax.io import leaderboard
+    from fleetjax.io import leaderboard, standings
 
     with _refusing():
         store = leaderboard.Store(arguments.results)
@@ -411,7 +411,7 @@ def lead(arguments: argparse.Namespace) -> None:
                 store.remove(arguments.algorithms)
             for entry in entries:
                 leaderboard.compete(store, entry)
-            print(leaderboard.publish(store))
+            print(standings.publish(store))
 
 
 COMMANDS: Mapping[str, Callable[[argparse.Namespace], None]] = {

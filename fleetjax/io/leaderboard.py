@@ -1,20 +1,22 @@
-"""Rules for help at equal human time: each is calibrated, run, and compared with the others from stored rows.
+"""Rules for help at equal human time: each is calibrated and run, and its rows are stored.
 
 A rule's threshold is calibrated on seed 100, so that a run spends a budget of human timesteps. Then it runs with seeds
-0, 1, ... The human time of a rule without a threshold is not controlled. No rule has an initial period, and extra
-demonstrations count as human time.
+0, 1, ... Rules that ask both by uncertainty and by risk have two thresholds: the uncertainty threshold is calibrated at each
+of several risk thresholds, and of the pairs that spend the budget the one with the most successes on seed 100 runs. The human
+time of a rule without a threshold is not controlled. No rule has an initial period, and extra demonstrations count as human
+time.
 """
 
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from fleetjax.checks import check_run
 from fleetjax.config import Config, get_value, make_config
-from fleetjax.io import calibration, comparing, files, folder, resumable, rows, text
+from fleetjax.io import calibration, files, folder, resumable, rows
 from fleetjax.io.outcomes import Group, Outcome, group
 from fleetjax.io.progress import say
 from fleetjax.io.sources import collect
@@ -28,6 +30,7 @@ BUDGETS = {  # human timesteps
     "allegro_hand": (10_000,),
 }
 FIXED = ("constraint", "constraint_trained", "longest_waiting")  # rules without a threshold
+RISK_THRESHOLDS = (0.5, 0.8, 0.95)  # that are tried; the first is the default
 CALIBRATED_ON = 100  # seed of calibrations
 MOST = 8  # runs in a calibration
 TOLERANCE = 0.05  # relative difference from the budget
@@ -61,10 +64,18 @@ class Entry(NamedTuple):
         return self.output / self.environment / self.algorithm
 
     @property
-    def request(self) -> calibration.Request:
-        """What is to be calibrated."""
+    def requests(self) -> dict[float | None, calibration.Request]:
+        """What is to be calibrated, by risk threshold; None = the rule has a threshold of its own, or does not ask by risk."""
         field = calibration.default_field(self.config)
-        return calibration.Request(self.config, field, self.budget, (CALIBRATED_ON,), TOLERANCE, MOST, self.folder)
+        fixed = (field, self.budget, (CALIBRATED_ON,), TOLERANCE, MOST)
+        if field != "uncertainty_threshold" or "safety" not in get_algorithm(self.algorithm).estimators:
+            return {None: calibration.Request(self.config, *fixed, self.folder)}
+        return {
+            risk: calibration.Request(
+                self.config.replace(risk_threshold=risk), *fixed, self.folder / f"risk_threshold-{risk:g}"
+            )
+            for risk in RISK_THRESHOLDS
+        }
 
 
 class Place(NamedTuple):
@@ -78,6 +89,7 @@ class Place(NamedTuple):
         value: that spends nearest to the budget.
         spent: human timesteps with it on the calibration's seed.
         solved: whether these are within 5 % of the budget.
+        risk_threshold: the rule's other threshold, if it was tuned too.
     """
 
     environment: str
@@ -87,6 +99,13 @@ class Place(NamedTuple):
     value: float
     spent: float
     solved: bool
+    risk_threshold: float | None = None
+
+    @property
+    def settings(self) -> dict[str, float]:
+        """The fields that were tuned, and their values."""
+        tuned = {self.field: self.value} if self.field else {}
+        return tuned if self.risk_threshold is None else tuned | {"risk_threshold": self.risk_threshold}
 
 
 class Store:
@@ -128,7 +147,9 @@ class Store:
         """Return the runs at a calibrated value, as one group."""
         here = [run for run in self.runs if (run.config.environment, run.config.algorithm) == place[:2]]
         same = [
-            run for run in here if not place.field or np.float32(get_value(run.config, place.field)) == np.float32(place.value)
+            run
+            for run in here
+            if all(np.float32(get_value(run.config, name)) == np.float32(value) for name, value in place.settings.items())
         ]
         return group(same)[-1] if same else None  # of different settings, the newest
 
@@ -165,7 +186,8 @@ def entries(
     if not found:
         raise ValueError("; ".join(obstacles))
     for entry in found:
-        calibration.check(entry.request)
+        for request in entry.requests.values():
+            calibration.check(request)
     for obstacle in obstacles:
         say(f"left out: {obstacle}")
     return found
@@ -182,18 +204,14 @@ def _obstacle(environment: str, algorithm: str) -> str:
 
 def compete(store: Store, entry: Entry) -> None:
     """Calibrate a rule and run it, but for what is stored; store each run when it is finished."""
-    config, place = entry.config, store.find(*entry[:3])
+    place = store.find(*entry[:3])
     if entry.algorithm in FIXED:
         place = Place(*entry[:3], "", 0.0, 0.0, solved=False)
     elif place is None:
-        request = entry.request
-        request.output.mkdir(parents=True, exist_ok=True)
-        found = calibration.calibrate(request)
-        place = Place(*entry[:3], request.field, found.value, found.human_time[0], bool(found.solved))
+        place = tune(entry)
     store.add(place)
-    name = f"{place.field}-{place.value:.6g}" if place.field else "as-it-is"
-    if place.field:
-        config = config.replace(**{place.field: place.value})
+    name = "-".join(f"{field}-{value:.6g}" for field, value in place.settings.items()) or "as-it-is"
+    config = entry.config.replace(**place.settings)
     known = {folder.name_of(run) for run in store.runs}
     for seed in range(entry.seeds):
         run = folder.Run(entry.folder / f"{name}-seed{seed}", config, seed)
@@ -202,94 +220,17 @@ def compete(store: Store, entry: Entry) -> None:
             store.add(place, collect(run.folder))
 
 
-def publish(store: Store) -> Path:
-    """Write the table and the figure of all that is stored; return the table's path."""
-    page = store.rows.with_suffix(".md")
-    files.write(page, table(store).encode())
-    files.write(page.with_suffix(".png"), draw(store))
-    return page
-
-
-def table(store: Store) -> str:
-    """Return the table of every environment and budget, the most successes first."""
-    parts = []
-    for environment in dict.fromkeys(place.environment for place in store.places):
-        for budget in sorted({place.budget for place in store.places if place.environment == environment}):
-            here = [place for place in store.places if place.environment == environment and place.budget == budget]
-            parts.append(f"## {environment}, {budget:,} human timesteps\n\n{_part(store, here)}")
-    return "\n\n".join(parts) + "\n"
-
-
-def _part(store: Store, places: list[Place]) -> str:
-    found = [(place, one) for place in places if (one := store.group_of(place))]
-    found.sort(key=lambda pair: -np.mean(_values(pair[1], "successes")))
-    reference = next((one for place, one in found if place.algorithm == "cur"), None)
-    lines: list[tuple[str, ...]] = [("", "seeds", "successes", "human time", "violations", "ROHE", "successes less C.U.R.'s")]
-    for place, one in found:
-        successes = _values(one, "successes")
-        cells = [
-            f"{text.label(place.algorithm)}{'' if place.solved else ' *'}",
-            str(len(successes)),
-            comparing.interval(successes),
-        ]
-        cells += [text.number(_human_time(one)), text.number(float(np.mean(_values(one, "violations"))))]
-        cells += [f"{np.mean(_values(one, 'rohe_with_demonstrations')):.3g}", _difference(one, reference)]
-        lines.append(tuple(cells))
-    return text.markdown_table(lines)
-
-
-def _difference(one: Group, reference: Group | None) -> str:
-    """Return how many more successes a rule has than C.U.R., by seeds that both have."""
-    if reference is None or one is reference:
-        return ""
-    mine, others = (comparing.values_by_seed(each, "successes") for each in (one, reference))
-    shared = sorted(mine.keys() & others.keys())
-    return comparing.interval(np.array([mine[seed] - others[seed] for seed in shared])) if shared else ""
-
-
-def _human_time(one: Group) -> float:
-    """Return the mean human time of a group, extra demonstrations included."""
-    return float(np.mean(_values(one, "human_steps"))) + int(one.config.extra_demonstrations)
-
-
-def _values(one: Group, metric: str) -> np.ndarray:
-    return np.array(list(comparing.values_by_seed(one, metric).values()))
-
-
-def draw(store: Store) -> bytes:
-    """Return the figure: successes against human time, a panel for each environment, a line for each algorithm."""
-    import matplotlib.pyplot as plt
-
-    from fleetjax.io import figure  # imported on demand
-
-    environments = list(dict.fromkeys(place.environment for place in store.places if store.group_of(place)))
-    with figure.style():
-        canvas, axes = plt.subplots(1, len(environments), figsize=(6.5 * len(environments), 5), squeeze=False)
-        for ax, environment in zip(axes[0], environments, strict=True):
-            _panel(ax, store, environment)
-        canvas.tight_layout()
-        return figure.render(canvas)
-
-
-def _panel(ax: Any, store: Store, environment: str) -> None:
-    """Draw an environment: C.U.R. and Random in colour, the others in grey, each named at its right end."""
-    lines = {}
-    for algorithm in dict.fromkeys(place.algorithm for place in store.places if place.environment == environment):
-        places = sorted(place for place in store.places if place[:2] == (environment, algorithm))
-        found = [one for place in places if (one := store.group_of(place))]
-        if found:
-            points = [
-                [measure(one) for one in found] for measure in (_human_time, lambda one: np.mean(_values(one, "successes")))
-            ]
-            lines[algorithm] = sorted(zip(*points, strict=True))
-    heights = sorted((points[-1][1], name) for name, points in lines.items())
-    least = 0.035 * max(height for height, _ in heights)
-    at = -np.inf
-    right = max(points[-1][0] for points in lines.values())
-    for height, name in heights:
-        at = max(height, at + least)
-        colour = {"cur": "#0072B2", "random": "#E69F00"}.get(name, "#999999")
-        ax.plot(*zip(*lines[name], strict=True), color=colour, marker="o", markersize=3, linewidth=2 if name == "cur" else 1.2)
-        ax.annotate(text.label(name), lines[name][-1], (1.06 * right, at), color=colour, va="center", fontsize=8)
-    ax.set(title=environment, xlabel="human timesteps", ylabel="successes", xlim=(0, 1.35 * right))
-    ax.set_ylim(bottom=0)
+def tune(entry: Entry) -> Place:
+    """Return the thresholds at which a rule spends its budget with the most successes, or comes nearest to it."""
+    best, most = None, (False, -np.inf)
+    for risk, request in entry.requests.items():
+        request.output.mkdir(parents=True, exist_ok=True)
+        found = calibration.calibrate(request)
+        (spent,) = found.human_time
+        place = Place(*entry[:3], request.field, found.value, spent, bool(found.solved), risk)
+        (run,) = collect(request.run(found.value, CALIBRATED_ON).folder)
+        merit = float(run.metrics.successes.sum()) if place.solved else -abs(spent - entry.budget)
+        if (place.solved, merit) > most:
+            best, most = place, (place.solved, merit)
+    assert best is not None
+    return best

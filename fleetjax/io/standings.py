@@ -1,0 +1,110 @@
+"""The leaderboard's table and figure, made from its stored rows."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fleetjax.io import comparing, files, text
+from fleetjax.io.leaderboard import Place, Store
+from fleetjax.io.outcomes import Group
+from fleetjax.statistics import mean_bounds
+
+COLOURS = ("#56B4E9", "#0072B2", "#D55E00")  # of budgets, from the smallest
+
+
+def publish(store: Store) -> Path:
+    """Write the table and the figure of all that is stored; return the table's path."""
+    page = store.rows.with_suffix(".md")
+    files.write(page, table(store).encode())
+    files.write(page.with_suffix(".png"), draw(store))
+    return page
+
+
+def table(store: Store) -> str:
+    """Return the table of every environment and budget, the most successes first."""
+    parts = []
+    for environment in dict.fromkeys(place.environment for place in store.places):
+        for budget in sorted({place.budget for place in store.places if place.environment == environment}):
+            here = [place for place in store.places if place.environment == environment and place.budget == budget]
+            parts.append(f"## {environment}, {budget:,} human timesteps\n\n{_part(store, here)}")
+    return "\n\n".join(parts) + "\n"
+
+
+def _part(store: Store, places: list[Place]) -> str:
+    found = [(place, one) for place in places if (one := store.group_of(place))]
+    found.sort(key=lambda pair: -np.mean(_values(pair[1], "successes")))
+    reference = next((one for place, one in found if place.algorithm == "cur"), None)
+    lines: list[tuple[str, ...]] = [("", "seeds", "successes", "human time", "violations", "ROHE", "successes less C.U.R.'s")]
+    for place, one in found:
+        successes = _values(one, "successes")
+        cells = [
+            f"{text.label(place.algorithm)}{'' if place.solved else ' *'}",
+            str(len(successes)),
+            comparing.interval(successes),
+        ]
+        cells += [text.number(_human_time(one)), text.number(float(np.mean(_values(one, "violations"))))]
+        cells += [f"{np.mean(_values(one, 'rohe_with_demonstrations')):.3g}", _difference(one, reference)]
+        lines.append(tuple(cells))
+    return text.markdown_table(lines)
+
+
+def _difference(one: Group, reference: Group | None) -> str:
+    """Return how many more successes a rule has than C.U.R., by seeds that both have."""
+    if reference is None or one is reference:
+        return ""
+    mine, others = (comparing.values_by_seed(each, "successes") for each in (one, reference))
+    shared = sorted(mine.keys() & others.keys())
+    return comparing.interval(np.array([mine[seed] - others[seed] for seed in shared])) if shared else ""
+
+
+def _human_time(one: Group) -> float:
+    """Return the mean human time of a group, extra demonstrations included."""
+    return float(np.mean(_values(one, "human_steps"))) + int(one.config.extra_demonstrations)
+
+
+def _values(one: Group, metric: str) -> np.ndarray:
+    return np.array(list(comparing.values_by_seed(one, metric).values()))
+
+
+def draw(store: Store) -> bytes:
+    """Return the figure: a panel for each environment, a row for each rule, its successes at each budget."""
+    import matplotlib.pyplot as plt
+
+    from fleetjax.io import figure  # imported on demand
+
+    environments = list(dict.fromkeys(place.environment for place in store.places if store.group_of(place)))
+    found = [
+        [(place, one) for place in store.places if place.environment == each and (one := store.group_of(place))]
+        for each in environments
+    ]
+    most = max(len({place.algorithm for place, _ in panel}) for panel in found)
+    with figure.style():
+        canvas, axes = plt.subplots(1, len(found), figsize=(5.5 * len(found), 1.4 + 0.27 * most), squeeze=False)
+        for ax, environment, panel in zip(axes[0], environments, found, strict=True):
+            _panel(ax, environment, panel)
+        canvas.tight_layout()
+        return figure.render(canvas)
+
+
+def _panel(ax: Any, environment: str, found: list[tuple[Place, Group]]) -> None:
+    """Draw an environment: the rule with the most successes at any budget at the top, hollow where it missed the budget."""
+    means = {place: float(np.mean(_values(one, "successes"))) for place, one in found}
+    rules = sorted({place.algorithm for place in means}, key=lambda rule: max(means[p] for p in means if p.algorithm == rule))
+    budgets = sorted({place.budget for place in means})
+    for place, one in found:
+        level = budgets.index(place.budget)
+        low, high = mean_bounds(_values(one, "successes"))
+        height = rules.index(place.algorithm) + 0.22 * (level - (len(budgets) - 1) / 2)
+        colour = COLOURS[level % len(COLOURS)]
+        ax.plot((low, high), (height, height), color=colour, linewidth=1.2)
+        ax.plot(means[place], height, "o", markersize=4, color=colour, markerfacecolor=colour if place.solved else "white")
+    for level, budget in enumerate(budgets):
+        ax.plot([], [], "o", markersize=4, color=COLOURS[level % len(COLOURS)], label=f"{budget:,}")
+    ax.set_yticks(range(len(rules)), [text.label(rule) for rule in rules])
+    if "cur" in rules:
+        ax.get_yticklabels()[rules.index("cur")].set_fontweight("bold")
+    ax.grid(axis="y", alpha=0.3)
+    ax.set(title=environment, xlabel="successes", ylim=(-0.7, len(rules) - 0.3))
+    ax.set_xlim(left=0)
+    ax.legend(title="human timesteps\n(hollow: missed)", loc="lower right")

@@ -25,7 +25,9 @@ from fleetjax.io.study import Study, make_study, plan
 from fleetjax.priority import get_algorithm
 
 HERE = Path(__file__).parent
-PARTS = ("main", "gradient_steps", "policies", "ablations", "humans", "times", "equal_budget")  # in this order
+PARTS = (  # in this order
+    *("main", "gradient_steps", "policies", "ablations", "humans", "times", "equal_budget", "demonstrations"),
+)
 TRAINED = "main"  # the part whose policies are evaluated
 METRICS = {
     "main": ("successes", "violations", "idle", "rohe", "rohe_with_demonstrations"),
@@ -86,7 +88,9 @@ class Part:
 
     def evaluate(self, trained: "Part") -> None:
         """Run the trained policies of another part, each with the seed after its own. Expert's run stands for itself."""
-        known = self.rows()
+        untrained = {name: run for name, run in trained.rows().items() if not get_algorithm(run.config.algorithm).pretrains}
+        known = untrained | self.rows()
+        self.store(known.values())
         missing = [run for run in plan(trained.study()) if folder.name_of(run) not in known]
         elsewhere = [run for run in missing if not is_finished(run)]
         for run in missing:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+import paper
 import pytest
 from commands import TINY, make_metrics, write_run
 
@@ -75,8 +76,8 @@ def make_rows(place: Path) -> None:
 def make_page(place: Path) -> None:
     """Write the same rows, and a page with room for all tables."""
     make_rows(place)
-    names = ("main", "gradient_steps", "ablations", "humans", "times", "equal_budget", "claims", "missing")
-    (place / "page.md").write_text("".join(f"<!-- {name} -->\nold\n<!-- end -->\n" for name in names))
+    parts = [part for part in paper.PARTS if part != "policies"]
+    (place / "page.md").write_text("".join(f"<!-- {name} -->\nold\n<!-- end -->\n" for name in (*parts, "claims", "missing")))
 
 
 TINY_STUDY = """

@@ -38,7 +38,7 @@ PUBLISHED = {  # successes of the trained policies (paper, Appendix); Fleet-TD i
         "expert": 21609,
     },
 }
-PAGES = ("results", "beat_cur", "leaderboard")
+PAGES = ("results", "beat_cur", "leaderboard", "humans")
 COLUMNS = {"successes": "successes", "violations": "violations", "human_steps": "human time", "rohe": "ROHE"}
 
 

@@ -120,16 +120,16 @@ def against_cur(found: list[Group]) -> str:
         for one in found:
             if one.config.environment == place:
                 here.setdefault(one.config.algorithm, one)  # those of the study come before older ones
-        reference = comparing.values_by_seed(here["cur"], "successes")
+        reference = comparing.values_by_seed(here["cur"], "successes") if "cur" in here else {}
         for algorithm in ("cur", "random", "teach_first"):
             if algorithm in here:
                 one = here[algorithm]
                 values = comparing.values_by_seed(one, "successes")
                 shared = sorted(values.keys() & reference.keys())
-                ratio = sum(values[seed] for seed in shared) / sum(reference[seed] for seed in shared)
+                ratio = sum(values[seed] for seed in shared) / sum(reference[seed] for seed in shared) if shared else None
                 cells = [f"{claims.NAMES[place]}, {text.label(algorithm)}", str(len(values))]
                 cells += [comparing.interval(np.array(list(values.values())))]
-                cells += ["" if algorithm == "cur" else f"{ratio:.2f}"]
+                cells += ["" if algorithm == "cur" or ratio is None else f"{ratio:.2f}"]
                 table.append((*cells, *(mean(one, metric) for metric in ("violations", "human_steps", "idle"))))
     return text.markdown_table(table)
 

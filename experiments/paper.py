@@ -35,11 +35,6 @@ METRICS = {
 }  # that are compared; those of `fleetjax compare` in other parts
 
 
-def is_finished(run: folder.Run) -> bool:
-    """Return whether the folder of a run holds all its timesteps."""
-    return folder.is_run(run.folder) and folder.read_finished(folder.read_run(run.folder)) is not None
-
-
 class Part:
     """A part of the study: its file, the folder of its runs, and its stored rows.
 
@@ -75,7 +70,7 @@ class Part:
         try:
             self.complete(missing)
         finally:
-            known |= {folder.name_of(run): collect(run.folder)[0] for run in missing if is_finished(run)}
+            known |= {folder.name_of(run): collect(run.folder)[0] for run in missing if sweep.is_finished(run)}
             wanted = dict.fromkeys([*map(folder.name_of, runs), *own])
             self.store(known[name] for name in wanted if name in known)
 
@@ -92,7 +87,7 @@ class Part:
         known = untrained | self.rows()
         self.store(known.values())
         missing = [run for run in plan(trained.study()) if folder.name_of(run) not in known]
-        elsewhere = [run for run in missing if not is_finished(run)]
+        elsewhere = [run for run in missing if not sweep.is_finished(run)]
         for run in missing:
             if run not in elsewhere:
                 self.evaluate_one(run, known)

@@ -64,15 +64,17 @@ def table(groups: Sequence[Group]) -> str:
     for place in places:
         cells = [_cell(groups, rule, place) for rule in rules]
         rows.append((place.name.replace("_", " "), place.level.replace("_", " "), *cells))
-    note = "Mean successes (95 % interval; with fewer than 5 seeds, smallest to largest), and how many percent they are of the "
-    note += "same rule's with perfect people."
+    note = (
+        "Mean successes (95 % interval; with fewer than 5 seeds, smallest to largest), how many percent they are of the same "
+    )
+    note += "rule's with perfect people, and mean human timesteps."
     return f"{text.markdown_table(rows)}\n\n{note}\n"
 
 
-def _find(groups: Sequence[Group], rule: str, place: Circumstance) -> np.ndarray:
-    """Return the successes of a rule in a circumstance, of each seed; empty if there are none."""
+def _find(groups: Sequence[Group], rule: str, place: Circumstance, metric: str = "successes") -> np.ndarray:
+    """Return a metric of a rule in a circumstance, of each seed; empty if there are none. Older settings stand behind."""
     found = [one for one in groups if one.config.algorithm == rule and circumstance(one.config) == place]
-    return np.array([value for one in found for value in comparing.values_by_seed(one, "successes").values()])
+    return np.array(list(comparing.values_by_seed(found[0], metric).values()) if found else [])
 
 
 def _cell(groups: Sequence[Group], rule: str, place: Circumstance) -> str:
@@ -80,7 +82,7 @@ def _cell(groups: Sequence[Group], rule: str, place: Circumstance) -> str:
     if not len(values):
         return ""
     share = f", {100 * values.mean() / perfect.mean():.0f} %" if place.name and perfect.sum() else ""
-    return comparing.interval(values) + share
+    return f"{comparing.interval(values)}{share}; {text.number(_find(groups, rule, place, 'human_steps').mean())}"
 
 
 def draw(groups: Sequence[Group]) -> bytes:
@@ -95,7 +97,8 @@ def draw(groups: Sequence[Group]) -> bytes:
         rows = -(-len(names) // columns)
         canvas, axes = plt.subplots(rows, columns, figsize=(4 * columns, 3.2 * rows), sharey=True, squeeze=False)
         for ax, name in zip(axes.flat, names, strict=False):
-            _panel(ax, groups, rules, [place for place in places if place.name in ("", name)])
+            here = [place for place in places if place.name == name]
+            _panel(ax, groups, rules, [_without(here[0], places), *here])
             ax.set_title(name.replace("_", " "))
         for ax in axes.flat[len(names) :]:
             ax.set_visible(False)
@@ -106,8 +109,15 @@ def draw(groups: Sequence[Group]) -> bytes:
         return figure.render(canvas)
 
 
+def _without(place: Circumstance, places: Sequence[Circumstance]) -> Circumstance:
+    """Return the circumstance that lacks only this imperfection: perfect people, or takeovers as long."""
+    _, _, besides = place.level.partition(", takeover_time ")
+    same = Circumstance("takeover_time", besides)
+    return same if same in places else PERFECT
+
+
 def _panel(ax: Any, groups: Sequence[Group], rules: Sequence[str], places: Sequence[Circumstance]) -> None:
-    """Draw a panel: perfect people at the left, then one level after the other."""
+    """Draw a panel: people without the imperfection at the left, then one level after the other."""
     for rule in rules:
         found = [(i, values) for i, place in enumerate(places) if len(values := _find(groups, rule, place))]
         if not found:
@@ -116,7 +126,8 @@ def _panel(ax: Any, groups: Sequence[Group], rules: Sequence[str], places: Seque
         low, high = np.array([statistics.mean_bounds(values) for _, values in found]).T
         error = np.stack([middle - low, high - middle])
         ax.errorbar([i for i, _ in found], middle, error, label=text.label(rule), marker="o", markersize=3, capsize=2)
-    ticks = [place.level.split(",")[0].replace("_", "\n").removesuffix(" people") for place in places]
+    ticks = [place.level.split(",")[0].replace("_", "\n") for place in places]
+    ticks[0] = "none"
     ax.set_xticks(range(len(places)), ticks)
 
 

@@ -25,7 +25,8 @@ def stored(tmp_path):
         runs = []
         for seed in range(3):
             metrics = make_metrics(seed, 40)
-            runs.append((config, seed, metrics._replace(successes=factor * metrics.successes)))
+            spent = np.full(40, 120 if field else 150, np.int32)  # of 5,000: within a tenth, and not
+            runs.append((config, seed, metrics._replace(successes=factor * metrics.successes, human_steps=spent)))
         value = float(fleetjax.config.get_value(config, field)) if field else 0.0
         place = leaderboard.Place("navigation", algorithm, 5000, field, value, 5000.0, solved=bool(field))
         store.add(place, sources.collect(runs))
@@ -57,6 +58,7 @@ def test_stored_runs_and_calibrations_are_read_again(stored):
     ("arguments", "reason"),
     [
         (("show", "cur"), "unexpected argument 'cur'"),
+        (("remove", "expert"), "nothing is stored of 'expert'; there is cur, random, constraint"),
         (("add",), "the following arguments are required: RULE"),
         ((), "the following arguments are required: ACTION"),
         (("add", "curr"), "algorithm = 'curr' is unknown; the closest are"),
@@ -80,7 +82,7 @@ def test_rules_with_two_thresholds_have_both_tuned(tmp_path, monkeypatch):
     assert all(request.config.risk_threshold == risk for risk, request in entry.requests.items())
     assert len({request.output for request in entry.requests.values()}) == len(entry.requests)
     assert tuple(other.requests) == (None,)
-    spends, successes = {0.5: 9000.0, 0.8: 5100.0, 0.95: 4900.0}, {0.5: 90, 0.8: 20, 0.95: 10}
+    spends, successes = {0.5: 9000.0, 0.8: 5100.0, 0.95: 4950.0}, {0.5: 90, 0.8: 10, 0.95: 20}
 
     def calibrate(request):
         spent = spends[round(float(request.config.risk_threshold), 2)]
@@ -97,9 +99,9 @@ def test_rules_with_two_thresholds_have_both_tuned(tmp_path, monkeypatch):
     monkeypatch.setattr(leaderboard, "collect", collect)
     place = leaderboard.tune(entry)
     assert place.solved
-    assert place.settings == {"uncertainty_threshold": 0.1, "risk_threshold": 0.8}
-    place = leaderboard.tune(entry._replace(budget=8000))
-    assert (place.solved, place.spent, place.risk_threshold) == (False, 9000.0, 0.5)
+    assert place.settings == {"uncertainty_threshold": 0.1, "risk_threshold": 0.95}
+    place = leaderboard.tune(entry._replace(budget=7000))
+    assert (place.solved, place.spent, place.risk_threshold) == (False, 5100.0, 0.8)
 
 
 def test_rules_that_need_goals_are_left_out_where_there_are_none(tmp_path, capsys):
@@ -109,11 +111,25 @@ def test_rules_that_need_goals_are_left_out_where_there_are_none(tmp_path, capsy
     assert "left out: humanoid: algorithm = 'thrifty_dagger' needs a goal" in capsys.readouterr().err
 
 
-def test_a_removed_rule_is_forgotten(stored):
+def test_a_removed_rule_is_forgotten(stored, capsys):
     assert cli.main(["leaderboard", "remove", "random", "--results", str(stored)]) == 0
+    assert "before you add a changed rule, delete them or choose another --output" in capsys.readouterr().err
     again = leaderboard.Store(stored)
     assert {run.config.algorithm for run in again.runs} == {"cur", "constraint"}
     assert "Random" not in (stored / "leaderboard.md").read_text()
+    assert cli.main(["leaderboard", "remove", "cur", "constraint", "--results", str(stored)]) == 0
+    assert [path.name for path in stored.iterdir() if path.suffix != ".lock"] == ["leaderboard.json"]
+    assert not leaderboard.Store(stored).places
+
+
+def test_only_runs_with_the_tuned_values_count(stored):
+    store = leaderboard.Store(stored)
+    place = store.find("navigation", "random", 5000)
+    assert place is not None
+    assert store.group_of(place) is not None
+    assert store.group_of(place._replace(value=place.value / 2)) is None
+    assert store.group_of(place._replace(risk_threshold=0.8)) is None
+    assert store.group_of(place._replace(risk_threshold=0.5)) is not None
 
 
 @pytest.mark.slow

@@ -40,7 +40,7 @@ class Request(NamedTuple):
     def run(self, value: float, seed: int) -> folder.Run:
         """Return a run with this value of the field."""
         value = float(np.float32(value))
-        path = self.output / f"{self.field}-{value:.6g}-seed{seed}"
+        path = self.output / f"{self.field}-{value:.9g}-seed{seed}"
         return folder.Run(path, self.config.replace(**{self.field: value}), seed)
 
 
@@ -109,7 +109,7 @@ def calibrate(request: Request) -> Calibration:
     )
     value, _ = min(tried, key=lambda pair: abs(pair[1] - request.human_time))
     spent = _over_seeds(request, value, others, tried)
-    moved = _corrected(request, value, spent, tried, scale)
+    moved = _corrected(request, value, spent, tried, scale) if others else None
     if moved is not None:
         tried.append((moved, _human_time(request, moved, first)))
         again = _over_seeds(request, moved, others, tried)

@@ -397,18 +397,19 @@ def lead(arguments: argparse.Namespace) -> None:
     from fleetjax.io import leaderboard, standings
 
     with _refusing():
-        store = leaderboard.Store(arguments.results)
-        if not store.runs:
+        if not leaderboard.Store(arguments.results).runs:
             raise ValueError(
-                f"there are no stored runs in {store.rows}; run this in a clone of the repository, or give --results DIR"
+                f"there are no stored runs in {arguments.results}; run this in a clone of the repository, or give --results DIR"
             )
         entries = []
         if arguments.action == "add":
             asked = (arguments.environments, arguments.budgets, arguments.seeds, arguments.output)
             entries = leaderboard.entries(arguments.algorithms, *asked)
         with files.lock(arguments.results):
+            store = leaderboard.Store(arguments.results)
             if arguments.action == "remove":
                 store.remove(arguments.algorithms)
+                say("their run folders remain: before you add a changed rule, delete them or choose another --output")
             for entry in entries:
                 leaderboard.compete(store, entry)
             print(standings.publish(store))

@@ -87,7 +87,8 @@ _LEADERBOARD_ABOUT = """Compare rules for help at equal human time. The stored r
 of it, or name their folder with --results.
 
 add: for each budget, find the threshold at which RULE spends it, run the rule, and store its runs. If add is interrupted,
-repeat the command. remove: forget what is stored of a rule, as after a change of its code. Each of them ends as show does."""
+repeat the command. remove: forget what is stored of a rule, as after a change of its code; then add it
+again with another --output. Each of them ends as show does."""
 _HUMANS_ABOUT = """Print how long people took to act on robots in a console session, how much longer if they came from another
 robot, and how often they were away: a table by seat, and the flags of `fleetjax run` that fit all of them together. Noise,
 mistakes and delays are not fitted."""

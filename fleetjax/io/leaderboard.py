@@ -1,10 +1,10 @@
 """Rules for help at equal human time: each is calibrated and run, and its rows are stored.
 
 A rule's threshold is calibrated on seed 100, so that a run spends a budget of human timesteps. Then it runs with seeds
-0, 1, ... Rules that ask both by uncertainty and by risk have two thresholds: the uncertainty threshold is calibrated at each
-of several risk thresholds, and of the pairs that spend the budget the one with the most successes on seed 100 runs. The human
-time of a rule without a threshold is not controlled. No rule has an initial period, and extra demonstrations count as human
-time.
+0, 1, ... A rule that asks by `uncertainty_threshold` and by `risk_threshold`, such as C.U.R., has both tuned: the first is
+calibrated at each of several values of the second, and of the pairs that spend the budget the one with the most successes on
+seed 100 runs. Other parameters keep their defaults. The human time of a rule without a threshold is not controlled. No rule has
+an initial period, and extra demonstrations count as human time.
 """
 
 import json
@@ -86,7 +86,7 @@ class Place(NamedTuple):
         algorithm: its name.
         budget: human timesteps that were wanted.
         field: the parameter that was searched; "" = the algorithm has none.
-        value: that spends nearest to the budget.
+        value: with which it spends the budget, or comes nearest.
         spent: human timesteps with it on the calibration's seed.
         solved: whether these are within 5 % of the budget.
         risk_threshold: the rule's other threshold, if it was tuned too.
@@ -133,7 +133,15 @@ class Store:
         self._write()
 
     def remove(self, algorithms: Sequence[str]) -> None:
-        """Forget all that is stored of these rules."""
+        """Forget all that is stored of these rules.
+
+        Raises:
+            ValueError: if nothing is stored of one of them.
+        """
+        known = dict.fromkeys(place.algorithm for place in self.places)
+        for algorithm in algorithms:
+            if algorithm not in known:
+                raise ValueError(f"nothing is stored of {algorithm!r}; there is {', '.join(known) or 'no rule'}")
         self.places = [place for place in self.places if place.algorithm not in algorithms]
         self.runs = [run for run in self.runs if run.config.algorithm not in algorithms]
         self._write()
@@ -141,6 +149,8 @@ class Store:
     def _write(self) -> None:
         if self.runs:
             files.write(self.rows, rows.write(self.runs))
+        else:
+            self.rows.unlink(missing_ok=True)
         files.write_json(self.table, {"calibrations": [one._asdict() for one in self.places]})
 
     def group_of(self, place: Place) -> Group | None:
@@ -204,13 +214,10 @@ def _obstacle(environment: str, algorithm: str) -> str:
 
 def compete(store: Store, entry: Entry) -> None:
     """Calibrate a rule and run it, but for what is stored; store each run when it is finished."""
-    place = store.find(*entry[:3])
-    if entry.algorithm in FIXED:
-        place = Place(*entry[:3], "", 0.0, 0.0, solved=False)
-    elif place is None:
-        place = tune(entry)
+    fixed = Place(*entry[:3], "", 0.0, 0.0, solved=False)
+    place = fixed if entry.algorithm in FIXED else store.find(*entry[:3]) or tune(entry)
     store.add(place)
-    name = "-".join(f"{field}-{value:.6g}" for field, value in place.settings.items()) or "as-it-is"
+    name = "-".join(f"{field}-{value:.9g}" for field, value in place.settings.items()) or "as-it-is"
     config = entry.config.replace(**place.settings)
     known = {folder.name_of(run) for run in store.runs}
     for seed in range(entry.seeds):
@@ -227,7 +234,7 @@ def tune(entry: Entry) -> Place:
         request.output.mkdir(parents=True, exist_ok=True)
         found = calibration.calibrate(request)
         (spent,) = found.human_time
-        place = Place(*entry[:3], request.field, found.value, spent, bool(found.solved), risk)
+        place = Place(*entry[:3], request.field, found.value, spent, found.solved, risk)
         (run,) = collect(request.run(found.value, CALIBRATED_ON).folder)
         merit = float(run.metrics.successes.sum()) if place.solved else -abs(spent - entry.budget)
         if (place.solved, merit) > most:

@@ -10,14 +10,19 @@ from fleetjax.io.leaderboard import Place, Store
 from fleetjax.io.outcomes import Group
 from fleetjax.statistics import mean_bounds
 
+MISSED = 0.1  # relative difference of the mean human time from the budget above which a rule is marked
 COLOURS = ("#56B4E9", "#0072B2", "#D55E00")  # of budgets, from the smallest
 
 
 def publish(store: Store) -> Path:
-    """Write the table and the figure of all that is stored; return the table's path."""
-    page = store.rows.with_suffix(".md")
-    files.write(page, table(store).encode())
-    files.write(page.with_suffix(".png"), draw(store))
+    """Write the table and the figure of all that is stored, or remove them if nothing is; return the table's path."""
+    page, picture = store.rows.with_suffix(".md"), store.rows.with_suffix(".png")
+    if store.runs:
+        files.write(page, table(store).encode())
+        files.write(picture, draw(store))
+    else:
+        page.unlink(missing_ok=True)
+        picture.unlink(missing_ok=True)
     return page
 
 
@@ -35,11 +40,13 @@ def _part(store: Store, places: list[Place]) -> str:
     found = [(place, one) for place in places if (one := store.group_of(place))]
     found.sort(key=lambda pair: -np.mean(_values(pair[1], "successes")))
     reference = next((one for place, one in found if place.algorithm == "cur"), None)
-    lines: list[tuple[str, ...]] = [("", "seeds", "successes", "human time", "violations", "ROHE", "successes less C.U.R.'s")]
+    lines: list[tuple[str, ...]] = [
+        ("", "seeds", "successes", "human time", "violations", "ROHE", "more successes than C.U.R.")
+    ]
     for place, one in found:
         successes = _values(one, "successes")
         cells = [
-            f"{text.label(place.algorithm)}{'' if place.solved else ' *'}",
+            f"{text.label(place.algorithm)}{' *' if _missed(place, one) else ''}",
             str(len(successes)),
             comparing.interval(successes),
         ]
@@ -61,6 +68,11 @@ def _difference(one: Group, reference: Group | None) -> str:
 def _human_time(one: Group) -> float:
     """Return the mean human time of a group, extra demonstrations included."""
     return float(np.mean(_values(one, "human_steps"))) + int(one.config.extra_demonstrations)
+
+
+def _missed(place: Place, one: Group) -> bool:
+    """Return whether the human time of the runs is not near the budget."""
+    return abs(_human_time(one) - place.budget) > MISSED * place.budget
 
 
 def _values(one: Group, metric: str) -> np.ndarray:
@@ -98,7 +110,9 @@ def _panel(ax: Any, environment: str, found: list[tuple[Place, Group]]) -> None:
         height = rules.index(place.algorithm) + 0.22 * (level - (len(budgets) - 1) / 2)
         colour = COLOURS[level % len(COLOURS)]
         ax.plot((low, high), (height, height), color=colour, linewidth=1.2)
-        ax.plot(means[place], height, "o", markersize=4, color=colour, markerfacecolor=colour if place.solved else "white")
+        ax.plot(
+            means[place], height, "o", markersize=4, color=colour, markerfacecolor="white" if _missed(place, one) else colour
+        )
     for level, budget in enumerate(budgets):
         ax.plot([], [], "o", markersize=4, color=COLOURS[level % len(COLOURS)], label=f"{budget:,}")
     ax.set_yticks(range(len(rules)), [text.label(rule) for rule in rules])

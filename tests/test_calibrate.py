@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 from commands import refused
 
@@ -31,7 +32,7 @@ def test_the_value_spends_the_time_in_runs_that_anyone_can_look_at(solved):
     assert found["field"] == "random_threshold"
     spent = []
     for seed in range(3):
-        run = folder.read_run(solved / f"random_threshold-{found['value']:.6g}-seed{seed}")
+        run = folder.read_run(solved / f"random_threshold-{np.float32(found['value'])!s}-seed{seed}")
         assert float(run.config.parameters["random_threshold"]) == pytest.approx(found["value"])
         spent.append(int(folder.read_metrics(run).human_steps.sum()))
     assert spent == found["human_time"]

@@ -39,9 +39,10 @@ class Request(NamedTuple):
 
     def run(self, value: float, seed: int) -> folder.Run:
         """Return a run with this value of the field."""
-        value = float(np.float32(value))
-        path = self.output / f"{self.field}-{value:.9g}-seed{seed}"
-        return folder.Run(path, self.config.replace(**{self.field: value}), seed)
+        exact = np.float32(value)
+        return folder.Run(
+            self.output / f"{self.field}-{exact!s}-seed{seed}", self.config.replace(**{self.field: float(exact)}), seed
+        )
 
 
 class Calibration(NamedTuple):

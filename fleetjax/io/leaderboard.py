@@ -217,7 +217,7 @@ def compete(store: Store, entry: Entry) -> None:
     fixed = Place(*entry[:3], "", 0.0, 0.0, solved=False)
     place = fixed if entry.algorithm in FIXED else store.find(*entry[:3]) or tune(entry)
     store.add(place)
-    name = "-".join(f"{field}-{value:.9g}" for field, value in place.settings.items()) or "as-it-is"
+    name = "-".join(f"{field}-{np.float32(value)!s}" for field, value in place.settings.items()) or "as-it-is"
     config = entry.config.replace(**place.settings)
     known = {folder.name_of(run) for run in store.runs}
     for seed in range(entry.seeds):

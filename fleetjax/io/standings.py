@@ -40,9 +40,7 @@ def _part(store: Store, places: list[Place]) -> str:
     found = [(place, one) for place in places if (one := store.group_of(place))]
     found.sort(key=lambda pair: -np.mean(_values(pair[1], "successes")))
     reference = next((one for place, one in found if place.algorithm == "cur"), None)
-    lines: list[tuple[str, ...]] = [
-        ("", "seeds", "successes", "human time", "violations", "ROHE", "more successes than C.U.R.")
-    ]
+    lines: list[tuple[str, ...]] = [("", "seeds", "successes", "human time", "violations", "ROHE", "successes minus C.U.R.'s")]
     for place, one in found:
         successes = _values(one, "successes")
         cells = [

@@ -4,9 +4,9 @@
 
 A claim says that some means over seeds are higher than others. Of each pair, the differences are taken seed by seed, and the
 95 % intervals of their means (BCa bootstrap) decide: the claim *holds* if all intervals lie above 0, *does not hold* if one
-whole interval lies below, and is *undecided* otherwise; it is *incomplete* while pairs are missing that could decide. With
-fewer than five seeds, the range of the differences stands for the interval, in parentheses: such a verdict is weak. One claim
-(8.8 times) needs one pair only. The table shows the difference that decides, or the closest one.
+whole interval lies below, and is *undecided* otherwise; it is *incomplete* while pairs that could decide are missing, or share
+one seed only. With fewer than five seeds, the range of the differences stands for the interval, in parentheses: such a verdict
+is weak. One claim (8.8 times) needs one pair only. The table shows the difference that decides, or the closest one.
 """
 
 import argparse
@@ -239,11 +239,11 @@ class Study:
         return {run.seed: measure(run) for run in found}
 
     def difference(self, claim: Claim, higher: Setting, lower: Setting | None) -> Difference | None:
-        """Return how much higher one group is than another; None if they share no seed."""
+        """Return how much higher one group is than another; None if they share fewer than two seeds, which show no spread."""
         ours = self.values(claim.part, higher, claim.measure)
         others = dict.fromkeys(ours, 0.0) if lower is None else self.values(claim.part, lower, claim.measure)
         pairs = np.array([ours[seed] - claim.factor * others[seed] for seed in sorted(ours.keys() & others.keys())])
-        if not len(pairs):
+        if len(pairs) < 2:
             return None
         times = f"{claim.factor} x " if claim.factor != 1 else ""
         name = f"{name_of(higher, lower)} - {times}{name_of(lower, higher)}" if lower else NAMES[claim.measure.__name__]

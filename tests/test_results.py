@@ -6,11 +6,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import claims
 import page
 import paper
 import pytest
+from commands import make_metrics
 
-from fleetjax.io import rows
+import fleetjax
+from fleetjax.io import rows, sources
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "experiments" / "results"
@@ -58,3 +61,20 @@ def test_a_page_shows_the_stored_rows(name, tmp_path):
 def test_the_page_of_results_has_every_table():
     names = re.findall(r"<!-- (\w+) -->", (ROOT / "docs" / "results.md").read_text())
     assert set(names) == {*paper.PARTS, "claims", "missing", "end"} - {"policies"}  # which stand in main's table
+
+
+@pytest.mark.parametrize(("seeds", "verdict"), [(0, "not run yet"), (1, "not run yet"), (2, "holds")])
+def test_a_pair_that_shares_one_seed_decides_nothing(tmp_path, seeds, verdict):
+    """C.U.R. has ten times the successes of Random, which has the first `seeds` of its seeds."""
+    runs = []
+    for algorithm, number in (("cur", 3), ("random", seeds)):
+        config = fleetjax.make_config("humanoid", algorithm, num_steps=40)
+        for seed in range(number):
+            metrics = make_metrics(seed, 40)
+            runs.append((config, seed, metrics._replace(successes=metrics.successes * (10 if algorithm == "cur" else 1))))
+    (tmp_path / "main.csv").write_bytes(rows.write(sources.collect(runs)))
+    one, other = ({"environment": "humanoid", "algorithm": name} for name in ("cur", "random"))
+    claim = claims.Claim("humanoid", "more successes", "main", lambda run: float(run.metrics.successes.sum()), [(one, other)])
+    found, difference = claims.judge(claims.Study(tmp_path), claim)
+    assert found == verdict
+    assert (difference is None) == (seeds < 2)

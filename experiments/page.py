@@ -18,7 +18,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import claims
-import numpy as np
 import paper
 import people
 
@@ -56,7 +55,7 @@ def readable(label: str) -> str:
 
 def mean(one: Group, metric: str, *, spread: bool = False) -> str:
     """Return the mean of a metric over seeds, with the smallest and the largest if asked for."""
-    found = np.array(list(comparing.values_by_seed(one, metric).values()))
+    found = comparing.values(one, metric)
     shown = text.number(found.mean())
     return f"{shown} ({text.number(found.min())} to {text.number(found.max())})" if spread and len(found) > 1 else shown
 
@@ -128,7 +127,7 @@ def against_cur(found: list[Group]) -> str:
                 shared = sorted(values.keys() & reference.keys())
                 ratio = sum(values[seed] for seed in shared) / sum(reference[seed] for seed in shared) if shared else None
                 cells = [f"{claims.NAMES[place]}, {text.label(algorithm)}", str(len(values))]
-                cells += [comparing.interval(np.array(list(values.values())))]
+                cells += [comparing.interval(comparing.values(one, "successes"))]
                 cells += ["" if algorithm == "cur" or ratio is None else f"{ratio:.2f}"]
                 table.append((*cells, *(mean(one, metric) for metric in ("violations", "human_steps", "idle"))))
     return text.markdown_table(table)

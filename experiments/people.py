@@ -65,16 +65,16 @@ def table(groups: Sequence[Group]) -> str:
         cells = [_cell(groups, rule, place) for rule in rules]
         rows.append((place.name.replace("_", " "), place.level.replace("_", " "), *cells))
     note = (
-        "Mean successes (95 % interval; with fewer than 5 seeds, smallest to largest), how many percent they are of the same "
+        "Each cell: mean successes (95 % interval; with fewer than 5 seeds, smallest to largest), the percentage of what the "
     )
-    note += "rule's with perfect people, and mean human timesteps."
+    note += "same rule has with perfect people, and mean human timesteps."
     return f"{text.markdown_table(rows)}\n\n{note}\n"
 
 
 def _find(groups: Sequence[Group], rule: str, place: Circumstance, metric: str = "successes") -> np.ndarray:
     """Return a metric of a rule in a circumstance, of each seed; empty if there are none. Older settings stand behind."""
     found = [one for one in groups if one.config.algorithm == rule and circumstance(one.config) == place]
-    return np.array(list(comparing.values_by_seed(found[0], metric).values()) if found else [])
+    return comparing.values(found[0], metric) if found else np.array([])
 
 
 def _cell(groups: Sequence[Group], rule: str, place: Circumstance) -> str:

@@ -124,6 +124,11 @@ def interval(values: np.ndarray) -> str:
     return f"{text.number(float(values.mean()))} ({text.number(float(low))} to {text.number(float(high))})"
 
 
+def values(one: Group, metric: str) -> np.ndarray:
+    """Return what the runs of a group achieved f64[S]."""
+    return np.array(list(values_by_seed(one, metric).values()))
+
+
 def values_by_seed(one: Group, metric: str) -> dict[int, float]:
     """Return what the runs of a group achieved, by seed."""
     return {seed: _value(run, metric) for seed, run in one.runs.items()}

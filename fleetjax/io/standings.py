@@ -38,18 +38,18 @@ def table(store: Store) -> str:
 
 def _part(store: Store, places: list[Place]) -> str:
     found = [(place, one) for place in places if (one := store.group_of(place))]
-    found.sort(key=lambda pair: -np.mean(_values(pair[1], "successes")))
+    found.sort(key=lambda pair: -np.mean(comparing.values(pair[1], "successes")))
     reference = next((one for place, one in found if place.algorithm == "cur"), None)
     lines: list[tuple[str, ...]] = [("", "seeds", "successes", "human time", "violations", "ROHE", "successes minus C.U.R.'s")]
     for place, one in found:
-        successes = _values(one, "successes")
+        successes = comparing.values(one, "successes")
         cells = [
             f"{text.label(place.algorithm)}{' *' if _missed(place, one) else ''}",
             str(len(successes)),
             comparing.interval(successes),
         ]
-        cells += [text.number(_human_time(one)), text.number(float(np.mean(_values(one, "violations"))))]
-        cells += [f"{np.mean(_values(one, 'rohe_with_demonstrations')):.3g}", _difference(one, reference)]
+        cells += [text.number(_human_time(one)), text.number(float(np.mean(comparing.values(one, "violations"))))]
+        cells += [f"{np.mean(comparing.values(one, 'rohe_with_demonstrations')):.3g}", _difference(one, reference)]
         lines.append(tuple(cells))
     return text.markdown_table(lines)
 
@@ -65,16 +65,12 @@ def _difference(one: Group, reference: Group | None) -> str:
 
 def _human_time(one: Group) -> float:
     """Return the mean human time of a group, extra demonstrations included."""
-    return float(np.mean(_values(one, "human_steps"))) + int(one.config.extra_demonstrations)
+    return float(np.mean(comparing.values(one, "human_steps"))) + int(one.config.extra_demonstrations)
 
 
 def _missed(place: Place, one: Group) -> bool:
     """Return whether the human time of the runs is not near the budget."""
     return abs(_human_time(one) - place.budget) > MISSED * place.budget
-
-
-def _values(one: Group, metric: str) -> np.ndarray:
-    return np.array(list(comparing.values_by_seed(one, metric).values()))
 
 
 def draw(store: Store) -> bytes:
@@ -83,11 +79,9 @@ def draw(store: Store) -> bytes:
 
     from fleetjax.io import figure  # imported on demand
 
-    environments = list(dict.fromkeys(place.environment for place in store.places if store.group_of(place)))
-    found = [
-        [(place, one) for place in store.places if place.environment == each and (one := store.group_of(place))]
-        for each in environments
-    ]
+    stored = [(place, one) for place in store.places if (one := store.group_of(place))]
+    environments = list(dict.fromkeys(place.environment for place, _ in stored))
+    found = [[pair for pair in stored if pair[0].environment == environment] for environment in environments]
     most = max(len({place.algorithm for place, _ in panel}) for panel in found)
     with figure.style():
         canvas, axes = plt.subplots(1, len(found), figsize=(5.5 * len(found), 1.4 + 0.27 * most), squeeze=False)
@@ -99,12 +93,12 @@ def draw(store: Store) -> bytes:
 
 def _panel(ax: Any, environment: str, found: list[tuple[Place, Group]]) -> None:
     """Draw an environment: the rule with the most successes at any budget at the top, hollow where it missed the budget."""
-    means = {place: float(np.mean(_values(one, "successes"))) for place, one in found}
+    means = {place: float(np.mean(comparing.values(one, "successes"))) for place, one in found}
     rules = sorted({place.algorithm for place in means}, key=lambda rule: max(means[p] for p in means if p.algorithm == rule))
     budgets = sorted({place.budget for place in means})
     for place, one in found:
         level = budgets.index(place.budget)
-        low, high = mean_bounds(_values(one, "successes"))
+        low, high = mean_bounds(comparing.values(one, "successes"))
         height = rules.index(place.algorithm) + 0.22 * (level - (len(budgets) - 1) / 2)
         colour = COLOURS[level % len(COLOURS)]
         ax.plot((low, high), (height, height), color=colour, linewidth=1.2)

@@ -294,18 +294,20 @@ def _checkpointer(use: Callable[[Any], Any]) -> Any:
 
 @contextlib.contextmanager
 def _without_traces() -> Iterator[None]:
-    """Keep traces off stderr that orbax and tensorstore print from threads of their own, besides raising the error."""
-    absl, usual = logging.getLogger("absl"), sys.unraisablehook
-    level = absl.level
+    """Keep traces off stderr that orbax, tensorstore and asyncio print from other threads, besides raising the error."""
+    loggers, usual = [logging.getLogger(name) for name in ("absl", "asyncio")], sys.unraisablehook
+    levels = [logger.level for logger in loggers]
 
     def hook(unraisable: Any) -> None:
         if str(unraisable.exc_value) != "Event loop is closed":  # of a write that failed; it may come late
             usual(unraisable)
 
-    absl.setLevel(logging.CRITICAL)
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL)
     sys.unraisablehook = hook
     yield
-    absl.setLevel(level)  # not after a failure, whose traces are still to come
+    for logger, level in zip(loggers, levels, strict=True):
+        logger.setLevel(level)  # not after a failure, whose traces are still to come
     sys.unraisablehook = usual
 
 

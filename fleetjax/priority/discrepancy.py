@@ -59,7 +59,7 @@ def of_lazy_dagger(config) -> Mapping[str, Any]:
 
 
 def dropout_dagger(config) -> Priority:
-    """Ask if p < `dropout_threshold`, the share p of samples of the robot's action within `dropout_tau` of the human's.
+    """Ask if p < `dropout_share`, the share p of samples of the robot's action within `dropout_threshold` of the human's.
 
     The human's action must be known before help, as in the original, so this is no rule for real fleets. Samples come from
     a normal distribution with the ensemble's mean and variance, in place of networks with dropout.
@@ -72,8 +72,8 @@ def dropout_dagger(config) -> Priority:
         spread = jnp.sqrt(known(signals.uncertainty))[:, None]
         draws = jax.random.normal(key, (SAMPLES, *signals.robot_action.shape))
         apart = jnp.mean((signals.robot_action + spread * draws - signals.human_action) ** 2, axis=-1)
-        share = jnp.mean(apart <= own["dropout_tau"], axis=0, dtype=jnp.float32)
-        return gated(signals, jnp.where(share < own["dropout_threshold"], 1.0 - share, 0.0))
+        share = jnp.mean(apart <= own["dropout_threshold"], axis=0, dtype=jnp.float32)
+        return gated(signals, jnp.where(share < own["dropout_share"], 1.0 - share, 0.0))
 
     return stateless(score)
 

@@ -305,7 +305,7 @@ def test_algorithm_scores(name):
         helped += np.sum(robot >= 0)
         aux = after
     eager, _ = priority.get_algorithm(name).make_priority(halved).score(signals, aux, key)
-    np.testing.assert_allclose(eager, jitted(name)(halved, signals, aux, key)[0], rtol=1e-6)
+    np.testing.assert_allclose(eager, jitted(name)(halved, signals, aux, key)[0], rtol=1e-5, atol=1e-6)
     assert helped > 0
     assert jitted(name)._cache_size() == 1
 

@@ -510,7 +510,7 @@ def port_of(monkeypatch):
 
 def run_console(path, port_of, **person) -> int:
     thread = play(port_of, **{"ticks": -1} | person)
-    given = ["--interval", "0.005", "--port", "0", "--output", str(path)]
+    given = ["--interval", "0.05", "--port", "0", "--output", str(path)]
     code = cli.main(["console", "navigation", *flags(), *given])
     if code == 0:
         thread.join()

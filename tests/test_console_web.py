@@ -228,8 +228,9 @@ def test_oversized_messages_close_the_client_alone(served):
 
 
 def test_a_flood_closes_the_client_alone(session):
-    with serving(session, interval=30.0) as served, served.page() as page, served.page() as other:
-        hear(page, "hello")
+    with serving(session, interval=30.0, wait=1) as served, served.page() as page, served.page() as other:
+        claim(page)
+        hear(page, "state")  # messages are counted from here
         for _ in range(server.MOST_MESSAGES + 1):
             say(page, type="seen")
         assert closing_code(page) == 1008
@@ -287,6 +288,7 @@ def wait_until_free(served) -> None:
 
 
 def test_a_lost_connection_frees_the_seat_and_gives_nothing_more(session):
+    session.config = session.engine.config = session.config.replace(min_teleop_time=10_000)  # help stays with its robot
     with serving(session, timeout=2.0) as served:
         with served.page() as page:
             claim(page)
@@ -456,7 +458,7 @@ def browser():
         pytest.skip("no chromium is installed")
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     with playwright.sync_playwright() as tools:
-        launched = tools.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        launched = tools.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"], timeout=180_000)
         yield launched
         launched.close()
 

@@ -55,4 +55,5 @@ def test_a_notebook_runs(notebook, tmp_path, monkeypatch):
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path))
     for rows in FOLDER.glob("*.csv"):
         shutil.copy(rows, tmp_path)
-    NotebookClient(notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": tmp_path}}).execute()
+    options = {"timeout": 600, "startup_timeout": 600, "resources": {"metadata": {"path": tmp_path}}}
+    NotebookClient(notebook, kernel_name="python3", **options).execute()

@@ -76,7 +76,7 @@ def test_a_film_is_that_of_the_run():
         config.replace(num_steps=5), key
     ).state  # the last picture is taken before the last timestep
     assert shot.seen[0].shape == (4, 2, 28)
-    np.testing.assert_array_equal(shot.seen[0][-1], expected.env.physics.qpos[:2])
+    np.testing.assert_allclose(shot.seen[0][-1], expected.env.physics.qpos[:2], atol=1e-4)  # two programs
     assert shot.teleoperated.all()
     assert not shot.violating.any()
 

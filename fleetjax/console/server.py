@@ -267,9 +267,10 @@ class Console:
         """Take timesteps at the pace that was asked for, or as fast as they go."""
         worker = ThreadPoolExecutor(1)
         in_worker = lambda *args: asyncio.get_running_loop().run_in_executor(worker, *args)  # noqa: E731
-        session, due = self.session, self._now()
+        session = self.session
         try:
             await self._wait_for_people()
+            due = self._now()
             while not session.over and not self._stop.is_set():
                 self._expire()
                 kinds = self.seats.kinds()

@@ -86,10 +86,10 @@ def start(config: Config, key: jax.Array, length: int, *, logged: bool = False) 
     Returns:
         FleetState: the state at t = 0; `run_chunks` from it finds its program compiled.
     """
-    first = config.replace(num_steps=min(length, config.num_steps))
     pool = ThreadPoolExecutor(2)  # this thread only waits: an interrupt within JAX's own code could get lost
     try:
         lowered = pool.submit(lambda: jax.jit(_prepare).lower(config, key)).result()
+        first = pool.submit(lambda: config.replace(num_steps=min(length, config.num_steps))).result()
         state = pool.submit(lambda: jax.block_until_ready(lowered.compile()(config, key)))
         pool.submit(lambda: _advance.lower(first, key, lowered.out_info, logged=logged).compile()).result()
         return state.result()

@@ -194,7 +194,8 @@ def test_lazy_dagger_has_the_bound_of_its_code():
 def test_dropout_dagger_asks_where_few_samples_are_near_the_human():
     s = signals_at(0, uncertainty=jnp.linspace(0.0, 0.3, N), violation=jnp.zeros(N, bool))
     offset = jnp.where(jnp.arange(N) % 2 == 0, 0.0, 0.5)[:, None]
-    (score,) = scores_of("dropout_dagger", [s._replace(human_action=s.robot_action + offset)], dropout_share=0.5, dropout_threshold=0.05)
+    given = {"dropout_share": 0.5, "dropout_threshold": 0.05}
+    (score,) = scores_of("dropout_dagger", [s._replace(human_action=s.robot_action + offset)], **given)
     rng = np.random.default_rng(0)
     noise = np.sqrt(np.asarray(s.uncertainty))[:, None] * rng.normal(size=(20_000, N, ACTIONS))
     share = np.mean(np.mean((noise - np.asarray(offset)) ** 2, axis=-1) <= 0.05, axis=0)

@@ -257,7 +257,8 @@ def test_only_a_run_is_overwritten(saved, tmp_path):
     (saved / "config.json").write_text("{")
     folder.check_folder(saved, overwrite=True)
     (tmp_path / "empty").mkdir()
-    (tmp_path / "empty" / files.LOCK).touch()  # as a kill may leave it
+    (tmp_path / "empty" / files.LOCK).touch()  # as a kill may leave them
+    (tmp_path / "empty" / ".config.json.partial").touch()
     folder.check_folder(tmp_path / "empty", overwrite=False)
 
 

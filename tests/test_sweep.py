@@ -244,6 +244,8 @@ def test_bad_files_cost_one_line_and_touch_nothing(name, capsys, tmp_path):
 def test_a_sweep_needs_an_environment_and_a_folder_of_its_own(capsys, tmp_path):
     assert "ENV is missing" in refused(capsys, "sweep", "--output", tmp_path / "out")
     assert "--output is missing; name a folder for the runs" in refused(capsys, "sweep", "navigation")
+    (tmp_path / ".sweep.json.partial").touch()  # as a kill may leave it
+    assert files.is_unused(tmp_path)
     (tmp_path / "precious").touch()
     assert "is not the folder of a sweep" in refused(capsys, "sweep", "navigation", "--output", tmp_path)
     assert f"{tmp_path / 'precious'} already exists" in refused(
@@ -460,9 +462,9 @@ def spawn(tmp_path_factory):
 
 
 def end(process: subprocess.Popen[str]) -> tuple[int, str, list[str]]:
-    """Return the exit code of a process, and what it printed: stdout, and the lines of stderr."""
+    """Return the exit code of a process, and what it printed: stdout, and the lines of stderr but for those that XLA logs."""
     out, err = process.communicate()
-    return process.returncode, out, err.splitlines()
+    return process.returncode, out, [line for line in err.splitlines() if not re.match(r"[IWE]\d{4} ", line)]
 
 
 @pytest.fixture(scope="module")
@@ -726,6 +728,13 @@ def test_a_launcher_needs_submitit(capsys, tmp_path, monkeypatch):
     said = refused(capsys, "sweep", "navigation", "--launcher", "local", "--output", tmp_path / "out")
     assert 'needs submitit; install it: pip install ".[cluster]"' in said
     assert not (tmp_path / "out").exists()
+
+
+def test_a_job_that_is_asked_to_stop_before_it_has_a_run_ends():
+    """submitit ignores SIGTERM; a job that has loaded nothing yet must not."""
+    program = "import signal\nsignal.signal(signal.SIGTERM, lambda *_: None)\nfrom fleetjax.io import job\n"
+    program += "job.complete_all = lambda job: signal.raise_signal(signal.SIGTERM)\njob.Job({}, 'sweep', None, None, 1.0)()"
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == -signal.SIGTERM
 
 
 @pytest.mark.long

@@ -10,12 +10,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-LOCK = ".lock"
+LOCK, PARTIAL = ".lock", ".partial"
 
 
 def write(path: Path, data: bytes) -> None:
     """Write a file under a temporary name and rename it, so that it is never seen half-written."""
-    partial = path.with_name(f".{path.name}.partial")
+    partial = path.with_name(f".{path.name}{PARTIAL}")
     try:
         with partial.open("wb") as file:
             file.write(data)
@@ -24,6 +24,14 @@ def write(path: Path, data: bytes) -> None:
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def is_unused(path: Path) -> bool:
+    """Return whether nothing is there, or a folder with no more than a process leaves that was killed as it began."""
+    if not os.path.lexists(path):
+        return True
+    names = [found.name for found in path.iterdir()] if path.is_dir() else [path.name]
+    return all(name == LOCK or (name.startswith(".") and name.endswith(PARTIAL)) for name in names)
 
 
 def check_place(path: Path) -> None:

@@ -8,7 +8,6 @@ import contextlib
 import csv
 import itertools
 import json
-import os
 import re
 import time
 from collections.abc import Iterator, Mapping
@@ -76,7 +75,7 @@ def check_folder(path: Path, *, overwrite: bool) -> None:
     Raises:
         FileExistsError: if something is there that is neither an empty folder nor, with `overwrite`, a run.
     """
-    if not os.path.lexists(path) or (path.is_dir() and {found.name for found in path.iterdir()} <= {files.LOCK}):
+    if files.is_unused(path):
         return
     if not is_run(path):
         raise FileExistsError(f"{path} already exists and is not a run folder; choose another --output")

@@ -5,6 +5,7 @@ What a job is sent is plain data, and nothing here loads JAX before the job has 
 
 import contextlib
 import os
+import signal
 import sys
 import time
 import traceback
@@ -38,6 +39,7 @@ class Job(NamedTuple):
 
     def __call__(self) -> None:
         """Complete runs until all have finished or failed."""
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)  # submitit ignores it, even while there is no run to stop
         cores = sorted(os.sched_getaffinity(0))
         Place(cores if self.core is None else [cores[self.core % len(cores)]], self.gpu).take()
         try:

@@ -7,7 +7,6 @@ of its run. Jobs of a cluster, which are nobody's children, agree by leases who 
 
 import contextlib
 import json
-import os
 import time
 from collections.abc import Sequence
 
@@ -35,8 +34,7 @@ def check_folder(study: Study, runs: Sequence[folder.Run]) -> None:
     """
     path = study.output
     if not (path / FILE).exists():
-        free = not os.path.lexists(path) or (path.is_dir() and {found.name for found in path.iterdir()} <= {files.LOCK})
-        files.expect(free, f"{path} already exists and is not the folder of a sweep; choose another --output")
+        files.expect(files.is_unused(path), f"{path} already exists and is not the folder of a sweep; choose another --output")
         return
     held = _read(study)
     files.expect(

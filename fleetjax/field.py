@@ -217,9 +217,6 @@ PARAMETERS: dict[str, Mapping[str, Field]] = {
             low=1,
             default=5000.0,
         ),
-        "reset_start": Field(
-            "up to when robots in violation wait, unless nobody is left to teach", "timesteps", int, default=0
-        ),
     },
     "whittle": {
         "whittle_threshold": Field("index, as worth of a timestep of help, at or below which no robot is helped", default=0.1),

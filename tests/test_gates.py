@@ -288,27 +288,23 @@ def test_longest_waiting_is_first_come_first_served():
         assert score.tolist() == np.maximum(t + 1 - since, 0).tolist()
 
 
-@given(st.integers(0, 100), st.sampled_from([1.0, 9.0, 1e6]), st.sampled_from([0, 5]))
-def test_teach_first_helps_moving_robots_until_its_time_is_spent(seed, teaching_time, reset_start):
+@given(st.integers(0, 100), st.sampled_from([1.0, 9.0, 1e6]))
+def test_teach_first_helps_moving_robots_until_its_time_is_spent(seed, teaching_time):
     steps = [signals_at(t, seed) for t in range(8)]
     taught = 0
-    scores = scores_of("teach_first", steps, teaching_time=teaching_time, reset_start=reset_start)
-    for t, (s, score) in enumerate(zip(steps, scores, strict=True)):
+    for t, (s, score) in enumerate(zip(steps, scores_of("teach_first", steps, teaching_time=teaching_time), strict=True)):
         taught += int(np.sum(s.given))
         chance = np.asarray(jax.random.uniform(jax.random.key(t), (N,)))
-        resets_first = 2 * taught >= teaching_time and t >= reset_start
         for robot, violated in enumerate(np.asarray(s.violation)):
             below = np.sum(score < score[robot])
-            if violated and taught >= teaching_time and not resets_first:
-                assert score[robot] == 0
-            elif violated:  # last, or first
+            if violated:  # last, or first
                 assert score[robot] > 0
-                assert below == (np.sum(~s.violation) if resets_first else 0)
+                assert below == (0 if 2 * taught < teaching_time else np.sum(~s.violation))
             elif taught >= teaching_time:
                 assert score[robot] == 0
             else:
                 behind = np.sum(~s.violation & (chance < chance[robot]))
-                assert below == behind + (0 if resets_first else np.sum(s.violation))
+                assert below == behind + (np.sum(s.violation) if 2 * taught < teaching_time else 0)
 
 
 def numpy_index(chains: np.ndarray, discount: float, state: int) -> float:

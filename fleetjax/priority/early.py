@@ -13,8 +13,7 @@ def teach_first(config) -> Priority:
     """Help random moving robots until humans have acted for `teaching_time` timesteps in all; after that, only reset robots.
 
     Violations come last in the first half of that time: a robot would soon fall again under a policy that has yet to learn. In
-    the second half they come first, but not before `reset_start`: up to that timestep a robot is reset only while there is time
-    left to teach, and only by humans who find no moving robot.
+    the second half they come first.
 
     Reference: fleetjax's own rule; docs/beat_cur.md compares it with others.
     """
@@ -22,11 +21,9 @@ def teach_first(config) -> Priority:
     def score(signals, taught, key):
         taught += sharding.total(signals.given.astype(jnp.float32))
         share = taught / config.parameters["teaching_time"]
-        early = signals.timestep < config.parameters["reset_start"]
         chance = jnp.where(signals.violation | (share >= 1), 0.0, jax.random.uniform(key, signals.violation.shape))
-        first = signals.violation & ~early & (share >= 0.5)
-        last = signals.violation & ~first & (share < 1)
-        return lexicographic(first, chance, last), taught
+        waits = signals.violation & (share < 0.5)
+        return lexicographic(signals.violation & ~waits, chance, waits), taught
 
     return Priority(init=lambda: jnp.zeros(()), score=score)
 

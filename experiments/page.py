@@ -7,7 +7,8 @@ A table stands between `<!-- NAME -->` and `<!-- end -->`, where NAME is one of:
 - a part of the study, such as `main`: what the algorithms achieved in it, each robot's one after the other.
 - `claims`: the verdicts of `claims.py`.
 - `missing`: how many runs of each part are stored, of how many, and what they ran on.
-- `teach_first`: how Teach First compares with C.U.R. and Random at equal human time.
+- `teach_first`, `teach_more`: how Teach First compares with C.U.R. and Random at equal human time, with 1 gradient step with 256
+  pairs a timestep, and with 2 with 512.
 - `leaderboard`: the table of `leaderboard.py`.
 - `people_ENV`: the table of `people.py`.
 """
@@ -83,10 +84,10 @@ def achieved(found: list[Group], alone: Mapping[str, Group]) -> str:
     return text.markdown_table(table)
 
 
-def groups(results: Path, part: str) -> list[Group]:
-    """Return the groups of a part's stored runs."""
-    path = results / f"{part}{rows.SUFFIX}"
-    return group(rows.read(path)) if path.exists() else []
+def groups(results: Path, *parts: str) -> list[Group]:
+    """Return the groups of the stored runs of some parts."""
+    paths = [results / f"{part}{rows.SUFFIX}" for part in parts]
+    return group([run for path in paths if path.exists() for run in rows.read(path)])
 
 
 def missing(args: argparse.Namespace) -> str:
@@ -111,10 +112,15 @@ def counts(stored: Mapping[str, Outcome], number: int) -> tuple[str, ...]:
     return str(len(stored)), str(number), ", ".join(processors), ", ".join(versions)
 
 
-def against_cur(found: list[Group]) -> str:
-    """Return a table of Teach First and Random beside C.U.R.; ratios are of the successes over the seeds that both have."""
+def against_cur(found: list[Group], *places: str) -> str:
+    """Return a table of Teach First and Random beside C.U.R.; ratios are of the successes over the seeds that both have.
+
+    Args:
+        found: groups of runs.
+        places: environments to show; none = all.
+    """
     table: list[tuple[str, ...]] = [("", "seeds", "successes", "times C.U.R.'s", "violations", "human time", "idle time")]
-    for place in dict.fromkeys(one.config.environment for one in found):
+    for place in places or dict.fromkeys(one.config.environment for one in found):
         here: dict[str, Group] = {}
         for one in found:
             if one.config.environment == place:
@@ -146,6 +152,7 @@ def tables(results: Path) -> dict[str, Callable[[], str]]:
         "claims": lambda: claims.verdicts(claims.Study(results)),
         "missing": lambda: missing(every),
         "teach_first": lambda: against_cur(groups(results, "equal_budget")),
+        "teach_more": lambda: against_cur(groups(results, "main", "teaching"), "humanoid"),
         "leaderboard": lambda: standings.table(leaderboard.Store(results)).strip(),
         **{name: lambda name=name: people.table(groups(results, name)).strip() for name in imperfect},
     }

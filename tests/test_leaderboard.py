@@ -74,10 +74,13 @@ def test_what_cannot_be_compared_is_refused(arguments, reason, stored, capsys):
     assert {path.name: path.read_bytes() for path in stored.iterdir()} == before
 
 
-def test_rules_with_two_thresholds_have_both_tuned(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("seeds", "best"), [((100,), 0.95), ((100, 101), 0.8)])
+def test_rules_with_two_thresholds_have_both_tuned(tmp_path, monkeypatch, seeds, best):
     """Of the risk thresholds at which a budget is met, the one with the most successes runs; if none is, the nearest."""
+    monkeypatch.setitem(leaderboard.CALIBRATED_ON, "navigation", seeds)
     (entry,) = leaderboard.entries(["cur"], ["navigation"], (5000,), 2, tmp_path)
     (other,) = leaderboard.entries(["thrifty_dagger"], ["navigation"], (5000,), 2, tmp_path)
+    assert all(request.seeds == seeds for request in entry.requests.values())
     assert tuple(entry.requests) == leaderboard.RISK_THRESHOLDS
     assert all(request.config.risk_threshold == risk for risk, request in entry.requests.items())
     assert len({request.output for request in entry.requests.values()}) == len(entry.requests)
@@ -87,19 +90,20 @@ def test_rules_with_two_thresholds_have_both_tuned(tmp_path, monkeypatch):
     def calibrate(request):
         spent = spends[round(float(request.config.risk_threshold), 2)]
         solved = abs(spent - request.human_time) <= 0.05 * request.human_time
-        return calibration.Calibration(0.1, (spent,), 0.0, solved, [(0.1, spent)])
+        each = tuple(spent + shift for shift in range(1 - len(seeds), len(seeds), 2))
+        return calibration.Calibration(0.1, each, 0.0, solved, [(0.1, spent)])
 
     def collect(path):
-        risk = float(path.parent.name.removeprefix("risk_threshold-"))
+        risk, seed = float(path.parent.name.removeprefix("risk_threshold-")), path.name.rpartition("-seed")[2]
         metrics = make_metrics(0, 40)
-        metrics = metrics._replace(successes=np.full(1, successes[risk]))
+        metrics = metrics._replace(successes=np.full(1, successes[risk] if seed == "100" else 60 - 2 * successes[risk]))
         return sources.collect([(entry.config, 100, metrics)])
 
     monkeypatch.setattr(calibration, "calibrate", calibrate)
     monkeypatch.setattr(leaderboard, "collect", collect)
     place = leaderboard.tune(entry)
     assert place.solved
-    assert place.settings == {"uncertainty_threshold": 0.1, "risk_threshold": 0.95}
+    assert place.settings == {"uncertainty_threshold": 0.1, "risk_threshold": best}
     place = leaderboard.tune(entry._replace(budget=7000))
     assert (place.solved, place.spent, place.risk_threshold) == (False, 5100.0, 0.8)
 

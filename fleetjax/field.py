@@ -188,8 +188,8 @@ PARAMETERS: dict[str, Mapping[str, Field]] = {
         "lazy_handback": Field("discrepancy at which a human hands back, as a share of discrepancy_tau", default=0.25),
     },
     "dropout_dagger": {
-        "dropout_threshold": Field("mean squared difference of actions up to which a sample is good", default=0.05),
-        "dropout_share": Field("share of good samples at or above which no robot asks", high=1, default=0.5),
+        "dropout_threshold": Field("mean squared difference up to which a sampled action is close to the human's", default=0.05),
+        "dropout_share": Field("a robot asks if fewer of its sampled actions are close", high=1, default=0.5),
     },
     "oracle_discrepancy": {
         "oracle_threshold": Field("mean squared difference of actions below which no robot asks", default=0.05),

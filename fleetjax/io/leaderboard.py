@@ -3,9 +3,9 @@
 A rule's threshold is calibrated on seed 100, so that a run spends a budget of human timesteps; on five seeds where fleets are
 so small that their human time differs much by chance. Then it runs with seeds 0, 1, ... A rule that asks by
 `uncertainty_threshold` and by `risk_threshold`, such as C.U.R., has both tuned: the first is calibrated at each of several
-values of the second, and of the pairs that spend the budget the one with the most successes on these seeds runs. Other
-parameters keep their defaults. The human time of a rule without a threshold is not controlled. No rule has an initial period,
-and extra demonstrations count as human time.
+values of the second. Of the pairs that spend the budget, we take the one with the most successes on the seeds of the
+calibration; if no pair does, the nearest. Other parameters keep their defaults. The human time of a rule without a threshold
+is not controlled. No rule has an initial period, and extra demonstrations count as human time.
 """
 
 import json

@@ -59,10 +59,10 @@ def of_lazy_dagger(config) -> Mapping[str, Any]:
 
 
 def dropout_dagger(config) -> Priority:
-    """Ask if p < `dropout_share`, the share p of samples of the robot's action within `dropout_threshold` of the human's.
+    """Ask if p < `dropout_share`, where p is the share of sampled actions within `dropout_threshold` of the human's.
 
-    The human's action must be known before help, as in the original, so this is no rule for real fleets. Samples come from
-    a normal distribution with the ensemble's mean and variance, in place of networks with dropout.
+    As in the original, the rule needs the human's action before it asks, so it cannot be used on real fleets. Samples come from
+    a normal distribution with the ensemble's mean and variance; the original samples networks with dropout.
 
     Reference: Menda et al., DropoutDAgger, 2017; reimplemented from the text.
     """

@@ -188,8 +188,10 @@ PARAMETERS: dict[str, Mapping[str, Field]] = {
         "lazy_handback": Field("discrepancy at which a human hands back, as a share of discrepancy_tau", default=0.25),
     },
     "dropout_dagger": {
-        "dropout_threshold": Field("mean squared difference up to which a sampled action is close to the human's", default=0.05),
-        "dropout_share": Field("a robot asks if fewer of its sampled actions are close", high=1, default=0.5),
+        "dropout_threshold": Field("mean squared difference up to which a sampled action is near the human's", default=0.05),
+        "dropout_share": Field(
+            "share of near actions, of those sampled, at or above which a robot does not ask", high=1, default=0.5
+        ),
     },
     "oracle_discrepancy": {
         "oracle_threshold": Field("mean squared difference of actions below which no robot asks", default=0.05),

@@ -112,15 +112,10 @@ def counts(stored: Mapping[str, Outcome], number: int) -> tuple[str, ...]:
     return str(len(stored)), str(number), ", ".join(processors), ", ".join(versions)
 
 
-def against_cur(found: list[Group], *places: str) -> str:
-    """Return a table of Teach First and Random beside C.U.R.; ratios are of the successes over the seeds that both have.
-
-    Args:
-        found: groups of runs.
-        places: environments to show; none = all.
-    """
+def against_cur(found: list[Group]) -> str:
+    """Return a table of Teach First and Random beside C.U.R.; ratios are of the successes over the seeds that both have."""
     table: list[tuple[str, ...]] = [("", "seeds", "successes", "times C.U.R.'s", "violations", "human time", "idle time")]
-    for place in places or dict.fromkeys(one.config.environment for one in found):
+    for place in dict.fromkeys(one.config.environment for one in found):
         here: dict[str, Group] = {}
         for one in found:
             if one.config.environment == place:
@@ -152,7 +147,9 @@ def tables(results: Path) -> dict[str, Callable[[], str]]:
         "claims": lambda: claims.verdicts(claims.Study(results)),
         "missing": lambda: missing(every),
         "teach_first": lambda: against_cur(groups(results, "equal_budget")),
-        "teach_more": lambda: against_cur(groups(results, "main", "teaching"), "humanoid"),
+        "teach_more": lambda: against_cur(
+            [one for one in groups(results, "main", "teaching") if one.config.environment == "humanoid"]
+        ),
         "leaderboard": lambda: standings.table(leaderboard.Store(results)).strip(),
         **{name: lambda name=name: people.table(groups(results, name)).strip() for name in imperfect},
     }

@@ -1,6 +1,7 @@
 """How tests look at what commands print and write."""
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,11 @@ def refused(capsys, *arguments: object) -> str:
     assert printed.err.endswith("\n")
     assert len(printed.err.splitlines()) == 1
     return printed.err
+
+
+def own_lines(errors: str) -> list[str]:
+    """Return what a process printed to stderr, line by line, but for what XLA logs on its own."""
+    return [line for line in errors.splitlines() if not re.match(r"[IWE]\d{4} ", line)]
 
 
 def make_metrics(seed: int = 0, steps: int = 40) -> Metrics:

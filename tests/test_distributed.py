@@ -12,6 +12,7 @@ import sys
 import time
 
 import pytest
+from commands import own_lines
 
 SMALL = {
     "--num-robots": 40,
@@ -128,8 +129,8 @@ def test_a_stopped_run_resumes_on_other_processes_and_on_other_devices(tmp_path,
 
 
 def only_line(errors):
-    """Return the one line of stderr that a process ended with, but for what XLA logs on its own."""
-    (line,) = [line for line in errors.splitlines() if not re.match(r"[IWE]\d{4} ", line)]
+    """Return the one line of stderr that a process ended with."""
+    (line,) = own_lines(errors)
     return line
 
 

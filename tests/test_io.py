@@ -248,7 +248,8 @@ def test_overwriting_spares_what_fleetjax_did_not_write(saved, config):
 def test_only_a_run_is_overwritten(saved, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("mine")
-    for path in (tmp_path / "mine", tmp_path / "mine" / "notes.txt"):
+    (tmp_path / files.LOCK).touch()
+    for path in (tmp_path / "mine", tmp_path / "mine" / "notes.txt", tmp_path / files.LOCK):
         for overwrite in (False, True):
             with pytest.raises(FileExistsError, match="already exists and is not a run folder"):
                 folder.check_folder(path, overwrite=overwrite)

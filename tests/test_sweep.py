@@ -14,7 +14,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from commands import contents, refused
+from commands import contents, own_lines, refused
 
 from fleetjax import checks, cli
 from fleetjax.io import chunks, crew, files, flags, folder, group, metrics_csv, place, resumable, study, sweep
@@ -462,9 +462,9 @@ def spawn(tmp_path_factory):
 
 
 def end(process: subprocess.Popen[str]) -> tuple[int, str, list[str]]:
-    """Return the exit code of a process, and what it printed: stdout, and the lines of stderr but for those that XLA logs."""
+    """Return the exit code of a process, and what it printed: stdout, and the lines of stderr."""
     out, err = process.communicate()
-    return process.returncode, out, [line for line in err.splitlines() if not re.match(r"[IWE]\d{4} ", line)]
+    return process.returncode, out, own_lines(err)
 
 
 @pytest.fixture(scope="module")

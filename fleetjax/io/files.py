@@ -30,8 +30,7 @@ def is_unused(path: Path) -> bool:
     """Return whether nothing is there, or a folder with no more than a process leaves that was killed as it began."""
     if not os.path.lexists(path):
         return True
-    names = [found.name for found in path.iterdir()] if path.is_dir() else [path.name]
-    return all(name == LOCK or (name.startswith(".") and name.endswith(PARTIAL)) for name in names)
+    return path.is_dir() and all(found.name == LOCK or found.match(f".*{PARTIAL}") for found in path.iterdir())
 
 
 def check_place(path: Path) -> None:

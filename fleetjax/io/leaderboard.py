@@ -33,7 +33,7 @@ BUDGETS = {  # human timesteps
 FIXED = ("constraint", "constraint_trained", "longest_waiting")  # rules without a threshold
 RISK_THRESHOLDS = (0.5, 0.8, 0.95)  # that are tried; the first is the default
 CALIBRATED_ON = {"block_push": (100, 101, 102, 103, 104)}  # seeds of calibrations; (100,) elsewhere
-MOST = 8  # runs in a calibration
+MOST = 8  # runs in which a calibration searches
 TOLERANCE = 0.05  # relative difference from the budget
 
 

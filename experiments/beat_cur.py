@@ -1,10 +1,12 @@
-"""Try rules that help early: makes the rows of the last table in docs/beat_cur.md.
+"""Try rules that help early: makes the rows of the last two tables in docs/beat_cur.md.
 
     python experiments/beat_cur.py [humanoid anymal allegro_hand] [--variants random-last,risk-last] [--seed 100] [--until T]
+    python experiments/beat_cur.py humanoid --variants teach-oldest -- --num-steps 3000 --batch-size 512 --gradient-steps 2
 
 A variant helps moving robots up to timestep T, chosen in some way. It resets robots before it helps others (`first`), after
-that (`last`), or not at all up to T / 2 and then first (`half`). Parameters of `fleetjax run` may follow after `--`. Prints a
-row for each run.
+that (`last`), or not at all up to T / 2 and then first (`half`). Variants whose name begins with `teach` are Teach First with
+one thing changed; give them `--teaching-time` instead of T. Parameters of `fleetjax run` may follow after `--`. Prints a row
+for each run.
 """
 
 import argparse
@@ -46,6 +48,31 @@ VARIANTS = {
     "held-last": Variant("held", "last"),
     "random-last-then-uncertain": Variant("random", "last", 0.05),
 }
+
+
+class Lesson(NamedTuple):
+    """How a variant of Teach First teaches.
+
+    Attributes:
+        at_once: share of `teaching_time` that is taught as fast as humans can.
+        spread: timesteps from which and up to which the rest is taught, at a constant rate.
+        oldest: whether robots are chosen by their time since the last reset, cubed, times a random number; else at random.
+        held: timesteps that a human stays with a robot in the first half of the teaching, if more than `min_teleop_time`.
+    """
+
+    at_once: float = 1.0
+    spread: tuple[float, float] = (0.0, 1.0)
+    oldest: bool = False
+    held: int = 0
+
+
+LESSONS = {
+    "teach": Lesson(),
+    "teach-evenly": Lesson(at_once=0.0, spread=(0.0, 900.0)),
+    "teach-some-later": Lesson(at_once=0.7, spread=(500.0, 1300.0)),
+    "teach-oldest": Lesson(oldest=True),
+    "teach-held": Lesson(held=150),
+}
 UNTIL = {"humanoid": 900.0, "anymal": 850.0, "allegro_hand": 900.0}  # timesteps
 
 
@@ -71,27 +98,56 @@ def make(variant: Variant, config: Any) -> Priority:
     return stateless(score)
 
 
-def main() -> None:
-    """Run the variants that are asked for."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    scripts.add_names(parser, "environments", tuple(UNTIL))
-    parser.add_argument("--variants", type=listed(str), default=[*VARIANTS], help="names [default: all]")
-    parser.add_argument("--seed", type=int, default=100)
-    parser.add_argument("--until", type=float, help="T [default: one for each environment]")
-    args, given = scripts.parse(parser)
-    if unknown := [name for name in args.variants if name not in VARIANTS]:
-        parser.error(f"unknown variants: {', '.join(unknown)}; choose from {', '.join(VARIANTS)}")
-    for name in args.variants:
-        variant = VARIANTS[name]
+def make_lesson(lesson: Lesson, config: Any) -> Priority:
+    """Return the variant of Teach First."""
+    begins, ends = lesson.spread
+
+    def score(signals, taught, key):
+        taught += jnp.sum(signals.given.astype(jnp.float32))
+        share = taught / config.parameters["teaching_time"]
+        allowed = lesson.at_once + (1 - lesson.at_once) * jnp.clip((signals.timestep - begins) / (ends - begins), 0, 1)
+        age = signals.episode_step / 1000.0 + 1e-3
+        value = jax.random.uniform(key, signals.violation.shape) * (age**3 if lesson.oldest else 1.0) + 1e-6
+        waits = signals.violation & (share < 0.5)
+        held = signals.helped & (signals.help_time < lesson.held) & (share < 0.5)
+        chosen = jnp.where(signals.violation | (share >= allowed), 0.0, value + held)
+        return lexicographic(signals.violation & ~waits, chosen, waits), taught
+
+    return Priority(init=lambda: jnp.zeros(()), score=score)
+
+
+def register() -> None:
+    """Register the variants."""
+    for name, variant in VARIANTS.items():
         own = {"help_until": Field("timestep at which the teaching ends", default=0.0)}
         estimators = ("safety",) if variant.choice == "risk" else ()
         fleetjax.register_priority(
             name, lambda config, variant=variant: make(variant, config), estimators=estimators, parameters=own
         )
+    for name, lesson in LESSONS.items():
+        own = {"teaching_time": Field("human timesteps of teaching", default=5500.0)}
+        fleetjax.register_priority(
+            name, lambda config, lesson=lesson: make_lesson(lesson, config), estimators=(), parameters=own
+        )
+
+
+def main() -> None:
+    """Run the variants that are asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    scripts.add_names(parser, "environments", tuple(UNTIL))
+    parser.add_argument("--variants", type=listed(str), default=[*VARIANTS], help="names [default: all with T]")
+    parser.add_argument("--seed", type=int, default=100)
+    parser.add_argument("--until", type=float, help="T [default: one for each environment]")
+    args, given = scripts.parse(parser)
+    known = (*VARIANTS, *LESSONS)
+    if unknown := [name for name in args.variants if name not in known]:
+        parser.error(f"unknown variants: {', '.join(unknown)}; choose from {', '.join(known)}")
+    register()
     print("| environment | variant | successes | violations | human time | idle time |\n|---|---|---:|---:|---:|---:|")
     for environment in args.environments:
         for name in args.variants:
-            settings = {"initial_period": 0, "help_until": UNTIL[environment] if args.until is None else args.until} | given
+            own = {"help_until": UNTIL[environment] if args.until is None else args.until} if name in VARIANTS else {}
+            settings = {"initial_period": 0} | own | given
             config = fleetjax.make_config(environment, name, **settings)
             totals = jax.tree.map(lambda x: int(x.sum()), fleetjax.run(config, jax.random.key(args.seed)).metrics)
             counts = (totals.successes, totals.violations, totals.human_steps, totals.idle)

@@ -77,7 +77,7 @@ def test_what_cannot_be_compared_is_refused(arguments, reason, stored, capsys):
 @pytest.mark.parametrize(("seeds", "best"), [((100,), 0.95), ((100, 101), 0.8)])
 def test_rules_with_two_thresholds_have_both_tuned(tmp_path, monkeypatch, seeds, best):
     """Of the risk thresholds at which a budget is met, the one with the most successes runs; if none is, the nearest."""
-    monkeypatch.setitem(leaderboard.CALIBRATED_ON, "navigation", seeds)
+    monkeypatch.setitem(leaderboard.EFFORTS, "navigation", leaderboard.Effort(seeds=seeds))
     (entry,) = leaderboard.entries(["cur"], ["navigation"], (5000,), 2, tmp_path)
     (other,) = leaderboard.entries(["thrifty_dagger"], ["navigation"], (5000,), 2, tmp_path)
     assert all(request.seeds == seeds for request in entry.requests.values())

@@ -144,8 +144,11 @@ CASES = {
         (row("1", r"\d+", r"[\d.]+", r"[\d.]+", "1.00"), row(r"\d+", "1", r"[\d.]+", r"[\d.]+", r"[\d.]+")),
     ),
     "experiments/beat_cur.py": Case(
-        (f"humanoid --variants random-half,risk-last --until 4 -- {FLEET}",),
-        (row("humanoid", "random-half", r"\d+", r"\d+", r"\d+", r"\d+"), row("humanoid", "risk-last", *[r"\d+"] * 4)),
+        (
+            f"humanoid --variants random-half,risk-last --until 4 -- {FLEET}",
+            f"humanoid --variants teach-oldest -- {FLEET} --teaching-time 4",
+        ),
+        tuple(row("humanoid", name, *[r"\d+"] * 4) for name in ("random-half", "risk-last", "teach-oldest")),
     ),
     "experiments/claims.py": Case(
         ("--results rows", "--results rows --output claims.md"),

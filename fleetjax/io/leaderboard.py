@@ -1,6 +1,6 @@
 """Rules for help at equal human time: each is calibrated and run, and its rows are stored.
 
-A rule's threshold is calibrated on seed 100, so that a run spends a budget of human timesteps; on five seeds where fleets are
+A rule's threshold is calibrated on seed 100, so that a run spends a budget of human timesteps; on three seeds where fleets are
 so small that their human time differs much by chance. Then it runs with seeds 0, 1, ... A rule that asks by
 `uncertainty_threshold` and by `risk_threshold`, such as C.U.R., has both tuned: the first is calibrated at each of several
 values of the second. Of the pairs that spend the budget, we take the one with the most successes on the seeds of the
@@ -32,9 +32,23 @@ BUDGETS = {  # human timesteps
 }
 FIXED = ("constraint", "constraint_trained", "longest_waiting")  # rules without a threshold
 RISK_THRESHOLDS = (0.5, 0.8, 0.95)  # that are tried; the first is the default
-CALIBRATED_ON = {"block_push": (100, 101, 102, 103, 104)}  # seeds of calibrations; (100,) elsewhere
-MOST = 8  # runs in which a calibration searches
-TOLERANCE = 0.05  # relative difference from the budget
+
+
+class Effort(NamedTuple):
+    """How carefully a threshold is calibrated.
+
+    Attributes:
+        seeds: of its runs; the search takes the first.
+        most: runs in which it searches.
+        tolerance: relative difference from the budget that is near enough.
+    """
+
+    seeds: tuple[int, ...] = (100,)
+    most: int = 8
+    tolerance: float = 0.05
+
+
+EFFORTS = {"block_push": Effort(seeds=(100, 101, 102), most=5, tolerance=0.1)}  # `Effort()` elsewhere
 
 
 class Entry(NamedTuple):
@@ -67,8 +81,8 @@ class Entry(NamedTuple):
     @property
     def requests(self) -> dict[float | None, calibration.Request]:
         """What is to be calibrated, by risk threshold; None = the rule has a threshold of its own, or does not ask by risk."""
-        field = calibration.default_field(self.config)
-        fixed = (field, self.budget, CALIBRATED_ON.get(self.environment, (100,)), TOLERANCE, MOST)
+        field, effort = calibration.default_field(self.config), EFFORTS.get(self.environment, Effort())
+        fixed = (field, self.budget, effort.seeds, effort.tolerance, effort.most)
         if field != "uncertainty_threshold" or "safety" not in get_algorithm(self.algorithm).estimators:
             return {None: calibration.Request(self.config, *fixed, self.folder)}
         return {
@@ -89,7 +103,7 @@ class Place(NamedTuple):
         field: the parameter that was searched; "" = the algorithm has none.
         value: with which it spends the budget, or comes nearest.
         spent: human timesteps with it, the mean over the calibration's seeds.
-        solved: whether these are within 5 % of the budget.
+        solved: whether these are near enough to the budget (`Effort.tolerance`).
         risk_threshold: the rule's other threshold, if it was tuned too.
     """
 

@@ -77,10 +77,11 @@ def test_what_cannot_be_compared_is_refused(arguments, reason, stored, capsys):
 @pytest.mark.parametrize(("seeds", "best"), [((100,), 0.95), ((100, 101), 0.8)])
 def test_rules_with_two_thresholds_have_both_tuned(tmp_path, monkeypatch, seeds, best):
     """Of the risk thresholds at which a budget is met, the one with the most successes runs; if none is, the nearest."""
-    monkeypatch.setitem(leaderboard.EFFORTS, "navigation", leaderboard.Effort(seeds=seeds))
+    effort = leaderboard.Effort(seeds=seeds, most=3, tolerance=0.07)
+    monkeypatch.setitem(leaderboard.EFFORTS, "navigation", effort)
     (entry,) = leaderboard.entries(["cur"], ["navigation"], (5000,), 2, tmp_path)
     (other,) = leaderboard.entries(["thrifty_dagger"], ["navigation"], (5000,), 2, tmp_path)
-    assert all(request.seeds == seeds for request in entry.requests.values())
+    assert all((request.seeds, request.most, request.tolerance) == effort for request in entry.requests.values())
     assert tuple(entry.requests) == leaderboard.RISK_THRESHOLDS
     assert all(request.config.risk_threshold == risk for risk, request in entry.requests.items())
     assert len({request.output for request in entry.requests.values()}) == len(entry.requests)

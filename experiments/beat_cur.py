@@ -1,4 +1,4 @@
-"""Try rules that help early: makes the rows of the last two tables in docs/beat_cur.md.
+"""Try rules that help early: makes the rows of the tables of variants in docs/beat_cur.md.
 
     python experiments/beat_cur.py [humanoid anymal allegro_hand] [--variants random-last,risk-last] [--seed 100] [--until T]
     python experiments/beat_cur.py humanoid --variants teach-oldest -- --num-steps 3000 --batch-size 512 --gradient-steps 2
@@ -51,7 +51,7 @@ VARIANTS = {
 
 
 class Lesson(NamedTuple):
-    """How a variant of Teach First teaches.
+    """How a variant teaches; by default as Teach First does.
 
     Attributes:
         at_once: share of `teaching_time` that is taught as fast as humans can.
@@ -67,7 +67,6 @@ class Lesson(NamedTuple):
 
 
 LESSONS = {
-    "teach": Lesson(),
     "teach-evenly": Lesson(at_once=0.0, spread=(0.0, 900.0)),
     "teach-some-later": Lesson(at_once=0.7, spread=(500.0, 1300.0)),
     "teach-oldest": Lesson(oldest=True),
@@ -108,8 +107,8 @@ def make_lesson(lesson: Lesson, config: Any) -> Priority:
         allowed = lesson.at_once + (1 - lesson.at_once) * jnp.clip((signals.timestep - begins) / (ends - begins), 0, 1)
         age = signals.episode_step / 1000.0 + 1e-3
         value = jax.random.uniform(key, signals.violation.shape) * (age**3 if lesson.oldest else 1.0) + 1e-6
-        waits = signals.violation & (share < 0.5)
-        held = signals.helped & (signals.help_time < lesson.held) & (share < 0.5)
+        early = share < 0.5
+        waits, held = signals.violation & early, signals.helped & (signals.help_time < lesson.held) & early
         chosen = jnp.where(signals.violation | (share >= allowed), 0.0, value + held)
         return lexicographic(signals.violation & ~waits, chosen, waits), taught
 

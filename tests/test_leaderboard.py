@@ -74,6 +74,16 @@ def test_what_cannot_be_compared_is_refused(arguments, reason, stored, capsys):
     assert {path.name: path.read_bytes() for path in stored.iterdir()} == before
 
 
+def test_robots_keep_the_initial_period_and_have_one_threshold_tuned(tmp_path):
+    for environment in leaderboard.BUDGETS:
+        (entry,) = leaderboard.entries(["cur"], [environment], leaderboard.BUDGETS[environment][:1], 3, tmp_path)
+        paper = fleetjax.make_config(environment, "cur")
+        is_robot = environment in ("humanoid", "anymal", "allegro_hand")
+        assert int(paper.initial_period) > 0
+        assert int(entry.config.initial_period) == (int(paper.initial_period) if is_robot else 0)
+        assert len(entry.requests) == (1 if is_robot else 3)
+
+
 @pytest.mark.parametrize(("seeds", "best"), [((100,), 0.95), ((100, 101), 0.8)])
 def test_rules_with_two_thresholds_have_both_tuned(tmp_path, monkeypatch, seeds, best):
     """Of the risk thresholds at which a budget is met, the one with the most successes runs; if none is, the nearest."""
@@ -81,8 +91,8 @@ def test_rules_with_two_thresholds_have_both_tuned(tmp_path, monkeypatch, seeds,
     monkeypatch.setitem(leaderboard.EFFORTS, "navigation", effort)
     (entry,) = leaderboard.entries(["cur"], ["navigation"], (5000,), 2, tmp_path)
     (other,) = leaderboard.entries(["thrifty_dagger"], ["navigation"], (5000,), 2, tmp_path)
-    assert all((request.seeds, request.most, request.tolerance) == effort for request in entry.requests.values())
-    assert tuple(entry.requests) == leaderboard.RISK_THRESHOLDS
+    assert all((request.seeds, request.most, request.tolerance) == effort[:3] for request in entry.requests.values())
+    assert tuple(entry.requests) == effort.risk_thresholds == (0.5, 0.8, 0.95)
     assert all(request.config.risk_threshold == risk for risk, request in entry.requests.items())
     assert len({request.output for request in entry.requests.values()}) == len(entry.requests)
     assert tuple(other.requests) == (None,)

@@ -4,8 +4,9 @@ A rule's threshold is calibrated on seed 100, so that a run spends a budget of h
 so small that their human time differs much by chance. Then it runs with seeds 0, 1, ... A rule that asks by
 `uncertainty_threshold` and by `risk_threshold`, such as C.U.R., has both tuned: the first is calibrated at each of several
 values of the second. Of the pairs that spend the budget, we take the one with the most successes on the seeds of the
-calibration; if no pair does, the nearest. Other parameters keep their defaults. The human time of a rule without a threshold
-is not controlled. No rule has an initial period, and extra demonstrations count as human time.
+calibration; if no pair does, the nearest. On the robots, where a run takes minutes, only the first is calibrated. Other
+parameters keep their defaults. The human time of a rule without a threshold is not controlled. The robots keep the paper's
+initial period; elsewhere no rule has one. Extra demonstrations count as human time.
 """
 
 import json
@@ -31,7 +32,6 @@ BUDGETS = {  # human timesteps
     "allegro_hand": (10_000,),
 }
 FIXED = ("constraint", "constraint_trained", "longest_waiting")  # rules without a threshold
-RISK_THRESHOLDS = (0.5, 0.8, 0.95)  # that are tried; the first is the default
 
 
 class Effort(NamedTuple):
@@ -41,14 +41,20 @@ class Effort(NamedTuple):
         seeds: of its runs; the search takes the first.
         most: runs in which it searches.
         tolerance: relative difference from the budget that is near enough.
+        risk_thresholds: that are tried, if the rule asks by risk; the first is the default.
     """
 
     seeds: tuple[int, ...] = (100,)
     most: int = 8
     tolerance: float = 0.05
+    risk_thresholds: tuple[float, ...] = (0.5, 0.8, 0.95)
 
 
-EFFORTS = {"block_push": Effort(seeds=(100, 101, 102), most=5, tolerance=0.1)}  # `Effort()` elsewhere
+ROBOTS = ("humanoid", "anymal", "allegro_hand")
+EFFORTS = {  # `Effort()` elsewhere
+    "block_push": Effort(seeds=(100, 101, 102), most=5, tolerance=0.1),
+    **dict.fromkeys(ROBOTS, Effort(most=4, tolerance=0.1, risk_thresholds=(0.5,))),
+}
 
 
 class Entry(NamedTuple):
@@ -71,7 +77,8 @@ class Entry(NamedTuple):
     @property
     def config(self) -> Config:
         """The configuration before it is calibrated."""
-        return make_config(self.environment, self.algorithm, initial_period=0)
+        early = {} if self.environment in ROBOTS else {"initial_period": 0}
+        return make_config(self.environment, self.algorithm, **early)
 
     @property
     def folder(self) -> Path:
@@ -89,7 +96,7 @@ class Entry(NamedTuple):
             risk: calibration.Request(
                 self.config.replace(risk_threshold=risk), *fixed, self.folder / f"risk_threshold-{risk:g}"
             )
-            for risk in RISK_THRESHOLDS
+            for risk in effort.risk_thresholds
         }
 
 
@@ -102,7 +109,7 @@ class Place(NamedTuple):
         budget: human timesteps that were wanted.
         field: the parameter that was searched; "" = the algorithm has none.
         value: with which it spends the budget, or comes nearest.
-        spent: human timesteps with it, the mean over the calibration's seeds.
+        spent: human timesteps with it, the mean over the calibration's seeds; None = not recorded.
         solved: whether these are near enough to the budget (`Effort.tolerance`).
         risk_threshold: the rule's other threshold, if it was tuned too.
     """
@@ -112,7 +119,7 @@ class Place(NamedTuple):
     budget: int
     field: str
     value: float
-    spent: float
+    spent: float | None
     solved: bool
     risk_threshold: float | None = None
 

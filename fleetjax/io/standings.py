@@ -74,20 +74,27 @@ def _missed(place: Place, one: Group) -> bool:
 
 
 def draw(store: Store) -> bytes:
-    """Return the figure: a panel for each environment, a row for each rule, its successes at each budget."""
+    """Return the figure: a panel for each environment, a row for each rule, its successes at each budget.
+
+    Environments with few rules stand below the others.
+    """
     import matplotlib.pyplot as plt
 
     from fleetjax.io import figure  # imported on demand
 
-    stored = [(place, one) for place in store.places if (one := store.group_of(place))]
-    environments = list(dict.fromkeys(place.environment for place, _ in stored))
-    found = [[pair for pair in stored if pair[0].environment == environment] for environment in environments]
-    most = max(len({place.algorithm for place, _ in panel}) for panel in found)
+    panels: dict[str, list[tuple[Place, Group]]] = {}
+    for place in store.places:
+        if one := store.group_of(place):
+            panels.setdefault(place.environment, []).append((place, one))
+    rules = {name: len({place.algorithm for place, _ in found}) for name, found in panels.items()}
+    few = [name for name in panels if 2 * rules[name] < max(rules.values())]
+    lines = [line for line in ([name for name in panels if name not in few], few) if line]
+    heights = [1.4 + 0.27 * max(rules[name] for name in line) for line in lines]
     with figure.style():
-        canvas, axes = plt.subplots(1, len(found), figsize=(5.5 * len(found), 1.4 + 0.27 * most), squeeze=False)
-        for ax, environment, panel in zip(axes[0], environments, found, strict=True):
-            _panel(ax, environment, panel)
-        canvas.tight_layout()
+        canvas = plt.figure(figsize=(5 * max(map(len, lines)), sum(heights)), layout="constrained")
+        for part, line in zip(canvas.subfigures(len(lines), 1, squeeze=False, height_ratios=heights)[:, 0], lines, strict=True):
+            for ax, name in zip(part.subplots(1, len(line), squeeze=False)[0], line, strict=True):
+                _panel(ax, name, panels[name])
         return figure.render(canvas)
 
 

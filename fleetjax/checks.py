@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 
 from fleetjax import envs, sharding
-from fleetjax.config import Config, taught_pairs, validate
+from fleetjax.config import Config, all_fields, get_value, taught_pairs, validate
 from fleetjax.envs import Env
 from fleetjax.fleet import FleetState, init, make_parts
 from fleetjax.learning import imitation
@@ -60,6 +60,7 @@ def check_run(config: Config, env: Env | None = None, state: FleetState | None =
 def check_plan(config: Config, env: Env | None = None, state: FleetState | None = None, *, copies: int = 1) -> Env:
     """Check as `check_run`, but not the backend: another process, which may have a GPU, computes `copies` of it at once."""
     validate(config, env)
+    check_single(config)
     check_mesh(config)
     env = env or envs.make(config.environment, config.backend)
     shapes = state_shapes(config, env)
@@ -67,6 +68,19 @@ def check_plan(config: Config, env: Env | None = None, state: FleetState | None 
     if state is not None:
         check_state(config, env, state, shapes)
     return env
+
+
+def check_single(config: Config) -> None:
+    """Check that each field has one value.
+
+    Raises:
+        ValueError: if one has several, which are a sweep.
+    """
+    for name, field in all_fields(config.algorithm).items():
+        shapes = [jnp.shape(value) for value in jax.tree.leaves(get_value(config, name))] if field.traced else []
+        if any(shapes):
+            each = "; for a value for each human, use a tuple" if field.per_human else ""
+            raise ValueError(f"{name} has shape {max(shapes)}, but a run has one value; use jax.vmap over several{each}")
 
 
 def check_mesh(config: Config) -> None:
@@ -189,7 +203,8 @@ def check_state(config: Config, env: Env, state: FleetState, shapes: FleetState)
 def _other_structure(config: Config, made_for: str) -> str:
     """Return the message for a state with another structure than a run needs."""
     if config.algorithm == made_for:
-        return f"the state has another structure than this configuration needs (hidden_sizes, estimators); {_REMEDY}"
+        differ = "hidden_sizes, estimators, human_model, link_model"
+        return f"the state has another structure than this configuration needs ({differ}); {_REMEDY}"
     return (
         f"algorithm = {config.algorithm!r} keeps other estimators or another memory than {made_for!r}, for which the state was "
         f"prepared; {_REMEDY}"

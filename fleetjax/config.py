@@ -13,7 +13,7 @@ import numpy as np
 from jax.core import Tracer
 
 from fleetjax import envs, humans, priority, supervisors
-from fleetjax.field import FIELDS, KINDS, OF_HUMANS, SHAPES_OF_HUMANS, Field, Fields, owners
+from fleetjax.field import FIELDS, KINDS, OF_HUMANS, OF_LINKS, SHAPES_OF_HUMANS, Field, Fields, owners
 from fleetjax.physics.base import BACKENDS
 from fleetjax.priority import estimators_of
 from fleetjax.registry import unknown
@@ -237,6 +237,8 @@ def make_config(environment: "str | envs.Env", algorithm: str = "cur", **overrid
     of_field = {key: field.default for key, field in known.items()}
     if any(override in OF_HUMANS for override in overrides):
         overrides = {"human_model": "imperfect"} | overrides
+    if any(override in OF_LINKS for override in overrides):
+        overrides = {"link_model": "gilbert_elliott"} | overrides
     config = Config().replace(**of_field | of_place | {"environment": name, "algorithm": algorithm} | overrides)
     of_others = dict(priority.get_algorithm(algorithm).defaults(config))
     bar = (env or envs.make(name, config.backend)).spec.success_return
@@ -245,6 +247,16 @@ def make_config(environment: "str | envs.Env", algorithm: str = "cur", **overrid
     config = config.replace(**{**of_others, **overrides})  # again: a human_capacity that is given must not grow unasked
     validate(config, env)
     return config
+
+
+def check_one_for_all(config: Config, name: str) -> None:
+    """Check that a field has one value for all humans.
+
+    Raises:
+        ValueError: if it has a tuple, a value for each.
+    """
+    if isinstance(get_value(config, name), tuple):
+        raise ValueError(f"{name} has a value for each human, and only one for all can be changed; pass one number")
 
 
 def validate(config: Config, env: "envs.Env | None" = None) -> None:
@@ -314,8 +326,35 @@ def _check_humans(config: Config) -> None:
         idle = config.human_model == "perfect" and name not in SHAPES_OF_HUMANS
         if idle and any(_is_concrete(x) and np.any(np.asarray(x) != 0) for x in jax.tree.leaves(value)):
             raise ValueError(f"{name} has no effect with human_model = 'perfect'; also pass human_model = 'imperfect'")
+    for name in OF_LINKS:
+        value = getattr(config, name)
+        usual = np.float32(FIELDS[name].default)
+        if config.link_model != "gilbert_elliott" and _is_concrete(value) and np.any(np.asarray(value, np.float32) != usual):
+            raise ValueError(
+                f"{name} has no effect with link_model = {config.link_model!r}; also pass link_model = 'gilbert_elliott'"
+            )
+    _check_absence(config)
     if config.allocation == "soft" and (config.human_model, config.link_model) != ("perfect", "perfect"):
         raise ValueError("allocation = 'soft' needs human_model = 'perfect' and link_model = 'perfect'")
+
+
+def _check_absence(config: Config) -> None:
+    """Check that humans can be away for such a share of the time, since whoever comes stays for a timestep at least.
+
+    Raises:
+        ValueError: if an absence would have to be longer.
+    """
+    for i in range(config.num_humans):
+        pair = [value[i] if isinstance(value, tuple) else value for value in (config.absence, config.absence_time)]
+        if not all(map(_is_concrete, pair)):
+            continue
+        share, time = (np.asarray(value, np.float32) for value in pair)
+        least = share / (1.0 - share)
+        if np.any(time < least * (1.0 - 1e-5)):
+            raise ValueError(
+                f"absence_time = {time!s} is too short for absence = {share!s}, since whoever comes stays for a timestep; "
+                f"make it at least {np.max(least):.3g}, or lower absence"
+            )
 
 
 def _check_soft(config: Config, algorithm: priority.Algorithm, env: envs.Env) -> None:
@@ -347,7 +386,9 @@ def _check_range(name: str, value: Any, field: Field) -> None:
         return
     values = np.asarray(value, np.float64)  # holds derived whole numbers that no integer type does
     low, high = field.low, field.high
-    if np.all(np.isfinite(values)) and (low is None or np.all(values >= low)) and (high is None or np.all(values <= high)):
+    least = -np.inf if low is None else min(low, float(np.float32(low)))  # a bound may be stored with 32 bits
+    most = np.inf if high is None else max(high, float(np.float32(high)))
+    if np.all(np.isfinite(values) & (values >= least) & (values <= most)):
         return
     allowed = f"in [{low}, {high}]" if high is not None else f"at least {low}"
     shown = value if values.ndim or isinstance(value, int) else value.item()

@@ -13,7 +13,7 @@ from fleetjax import envs, sharding
 from fleetjax.checks import check_run
 from fleetjax.config import Config
 from fleetjax.distribute import alone, place, spread
-from fleetjax.field import FIELDS, OF_HUMANS
+from fleetjax.field import FIELDS, OF_HUMANS, OF_LINKS
 from fleetjax.fleet import FleetState, init, logged_step, make_parts
 from fleetjax.keys import key_at
 from fleetjax.learning.imitation import PolicyState, create_data
@@ -238,5 +238,5 @@ def evaluate(config: Config, key: jax.Array, policy: PolicyState, env: envs.Env 
 
 def without_teleoperation(config: Config) -> Config:
     """Return a configuration in which humans only reset robots in violation, and nothing is learnt."""
-    neutral = {name: FIELDS[name].default for name in OF_HUMANS}
+    neutral = {name: FIELDS[name].default for name in (*OF_HUMANS, *OF_LINKS)}
     return config.replace(algorithm="constraint", allocation="hard", human_model="perfect", link_model="perfect", **neutral)

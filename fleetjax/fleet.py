@@ -18,7 +18,7 @@ from fleetjax.allocation import Allocator, helper_of
 from fleetjax.config import Config
 from fleetjax.envs import Env
 from fleetjax.humans import HumanModel, Links
-from fleetjax.keys import Keys, key_of_links, key_of_people, split_keys
+from fleetjax.keys import Keys, key_of_links, key_of_people, key_of_presence, split_keys
 from fleetjax.learning import buffer, imitation
 from fleetjax.learning.critic import CriticState
 from fleetjax.learning.estimator import Estimator, Step
@@ -174,7 +174,7 @@ def init(parts: Parts, key: jax.Array, policy: PolicyState, data: HumanData, est
 def logged_step(parts: Parts, state: FleetState, key: jax.Array) -> tuple[FleetState, tuple[Metrics, Interventions]]:
     """Take a timestep with the simulated supervisor; return also what each human who teleoperated saw and did."""
     keys = split_keys(key, parts.config.num_robots)
-    there = parts.people.available(state.people, key_of_people(key)) if parts.people else None
+    there = parts.people.available(state.people, key_of_presence(key)) if parts.people else None
     state, planned = plan(parts, state, keys, there)
     human_action, given = supervise(parts, state.env, keys), planned.teleoperated
     people, links = state.people, state.links

@@ -19,7 +19,7 @@ from jax.core import Tracer
 from jax.interpreters import partial_eval
 
 from fleetjax import checks
-from fleetjax.config import Config, all_fields, get_value
+from fleetjax.config import Config, all_fields, check_one_for_all, get_value
 from fleetjax.envs import Env
 from fleetjax.experiment import prepare, run, step_once
 from fleetjax.field import OFFLINE, Field
@@ -273,6 +273,7 @@ def _check_fields(config: Config, names: Sequence[str], method: str) -> None:
         field = known[name]
         if not field.traced or field.kind is bool:
             raise ValueError(f"field {name} is {'static' if not field.traced else 'a switch'}; it has no derivative")
+        check_one_for_all(config, name)
         if name in OFFLINE:
             raise ValueError(f"field {name} acts only before t = 0, and the fleet at t = 0 is held fixed; omit it")
         if field.kind is int and method != "smoothed":

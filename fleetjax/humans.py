@@ -24,7 +24,8 @@ class HumanModel(NamedTuple):
         init: `(config, key) -> aux`, at t = 0.
         available: `(aux, key) -> bool[M]`, the humans who are there.
         act: `(aux, Plan, action f32[N, A], key) -> (aux, action f32[N, A], given bool[N])`: what humans really do, of what the
-            supervisor would do, and on which robots. On the others their own policy acts, and nothing is recorded.
+            supervisor would do, and on which robots. On the others their own policy acts, and nothing is recorded. Its key is
+            another than that of `available`.
         unready: `aux -> i32[M]`, timesteps of the current intervention that each human spent taking over; they do not count
             towards t_T, the shortest teleoperation. None = 0.
     """
@@ -78,7 +79,8 @@ def make_imperfect(config: Any, spec: EnvSpec) -> HumanModel:
     - Takeover: a human acts on a new robot only after a takeover time, and `switching_lag` more after another robot. The sum is
       rounded up or down by chance, so that its mean is kept. Meanwhile the robot's policy acts, and the human's time counts.
       The shortest teleoperation t_T starts after the takeover. Hard resets take t_R, as ever.
-    - Delay: the action is the one for what the robot was in `action_delay` timesteps ago, but not before its last reset.
+    - Delay: the action is the one for what the robot was in `action_delay` timesteps ago, a whole number, but not before its
+      last reset.
     - Skill: normal noise on continuous actions, and a random action in its place with `mistake_rate`.
     - Fatigue: takeover time and noise are multiplied by 1 + `fatigue` b, for the share b of recent time in which the human was
       busy.
@@ -123,7 +125,7 @@ def make_imperfect(config: Any, spec: EnvSpec) -> HumanModel:
             done = jnp.where(deviation > 0, noisy, done)
         wrong = jax.random.uniform(key_whether, (n,)) < mistakes[helper]
         done = jnp.where(wrong[:, None], _any_action(spec, n, key_what), done)
-        leaves = absence / jnp.maximum((1.0 - absence) * absence_time, 1e-6)
+        leaves = absence / ((1.0 - absence) * absence_time)
         chance = jax.random.uniform(key_away, (m,))
         away = jnp.where(people.away, chance >= 1.0 / absence_time, chance < leaves)
         busy = people.busy + ((robot >= 0).astype(jnp.float32) - people.busy) / TIRING
@@ -198,7 +200,8 @@ def make_unequal(config: Any) -> Links:
     """Links of which a random 70 % work with chance 0.2, the others with 0.9, at each timestep.
 
     Reference: the static scenario of ASA's published code (Fleet-Supervisor-Allocation). There links are drawn once, when a
-    human is assigned, and hard resets need them too: a human whose link fails does not come at all.
+    human is assigned, and hard resets need them too. A human whose link fails does not come at all, and can help nobody for
+    as long as a hard reset takes.
     """
 
     def init(key: jax.Array) -> Lines:

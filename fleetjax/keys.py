@@ -45,6 +45,11 @@ def key_of_people(key: jax.Array) -> jax.Array:
     return jax.random.fold_in(key, 2**31 - 1)
 
 
+def key_of_presence(key: jax.Array) -> jax.Array:
+    """Return the key of who is there, at the timestep whose key is given."""
+    return jax.random.fold_in(key, 2**31 - 3)
+
+
 def key_of_links(key: jax.Array) -> jax.Array:
     """Return the key of the links, at the timestep whose key is given."""
     return jax.random.fold_in(key, 2**31 - 2)

@@ -634,6 +634,21 @@ def test_the_fleets_page_says_when_resets_begin():
     assert pages._resets_begin(uncertain_first, 0) == -1
 
 
+@pytest.mark.parametrize(("timestep", "stuck", "begins"), [(49, True, 50), (50, True, -1), (49, False, -1)])
+def test_people_who_are_free_are_told_when_resets_begin(timestep, stuck, begins):
+    config = make_config(algorithm="cur", initial_period=50)
+    session, none, high = (
+        cast(Any, SimpleNamespace(config=config, curves=[[0.0] * 4])),
+        np.zeros(4, bool),
+        np.zeros(4, np.float32),
+    )
+    violation = np.array([stuck, False, False, False])
+    view = View(timestep, np.array([-1, -1]), np.zeros(2, int), none, violation, high, high, high, high)
+    assert pages.operator(session, view, 0, seats.Seat("key"), {})["resets_begin"] == begins
+    fleet = pages.fleet(session, view, np.zeros(2, int), [False, False], {})
+    assert fleet["resets_begin"] == (50 if timestep < 50 else -1)
+
+
 @pytest.mark.parametrize(("given", "period"), [([], 0), (["--initial-period", "7"], 7)])
 def test_a_console_has_no_initial_period_unless_asked_for(given, period):
     from fleetjax.io import commands
@@ -643,3 +658,11 @@ def test_a_console_has_no_initial_period_unless_asked_for(given, period):
     assert int(commands._config(arguments, commands._parameters(arguments)).initial_period) == period
     arguments = command_line.parse(["run", "navigation"])
     assert int(commands._config(arguments, commands._parameters(arguments)).initial_period) == 500
+
+
+def test_the_consoles_help_shows_its_own_initial_period(capsys):
+    for command, default in (("console", "0"), ("run", "500")):
+        with pytest.raises(SystemExit):
+            cli.main([command, "navigation", "--help"])
+        shown = " ".join(capsys.readouterr().out.split())
+        assert f"[default: {default}]" in shown.split("--initial-period")[1].split("--")[0]

@@ -70,6 +70,18 @@ def test_the_fit_finds_the_model_that_people_follow(patience):
     assert (found.absence, found.absence_time) == (0, 100)
 
 
+@pytest.mark.parametrize(("mean", "spread", "help_time"), [(6.0, 0.5, 5), (2.7, 0.5, 3), (6.0, 0.3, 5)])
+def test_help_that_ends_before_most_takeovers_does_not_bias_the_fit(mean, spread, help_time):
+    """Takeovers are whole timesteps, and help of L timesteps shows those of less than L."""
+    number = 4000
+    key, other = jax.random.split(jax.random.key(1))
+    times = np.asarray(takeover_times(jnp.full(number, mean), jnp.full(number, spread), key))
+    whole = np.floor(times + np.asarray(jax.random.uniform(other, (number,)))).astype(int)
+    found = fitting._lognormal([Takeover(min(int(time), help_time), bool(time < help_time), False) for time in whole])
+    assert found[0] == pytest.approx(mean, rel=0.1)
+    assert found[1] == pytest.approx(spread, abs=0.1)
+
+
 def test_people_who_act_at_once_need_no_time():
     rows = record([PERSON] * 12, [n // 2 for n in range(12)], [1] * 12)
     assert fitting.fit(rows, [0], absence_time=100.0).takeover_time == 0

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import fleetjax
 from fleetjax import HumanState, Signals, priority
 from fleetjax.fleet import make_parts
-from fleetjax.learning import buffer, help, novelty
+from fleetjax.learning import buffer, help, networks, novelty
 from fleetjax.learning.critic import Transition
 from fleetjax.priority import coverage, quantiles, whittle
 
@@ -71,6 +71,13 @@ def ranks(asking, violation) -> list[float]:
     rows = list(zip(np.asarray(asking, np.float32).tolist(), np.asarray(violation, float).tolist(), strict=True))
     places = {row: i for i, row in enumerate(sorted(set(rows) | {(0.0, 0.0)}))}
     return [float(places[row]) for row in rows]
+
+
+def assert_more_asks_first(score, asking) -> None:
+    """Check that of two robots that ask, the one that asks more has the higher score; violations come after them."""
+    asks = score > np.min(score[score > 0], initial=np.inf)
+    order = np.argsort(-score[asks])
+    assert np.all(np.diff(np.asarray(asking)[asks][order]) <= 0)
 
 
 def numpy_teleoperated(s: Signals) -> np.ndarray:
@@ -144,6 +151,36 @@ def test_quantile_ensemble():
         u, violation = np.asarray(s.uncertainty), np.asarray(s.violation)
         assert np.all(score[(u > high) | violation] > 0)
         assert not np.any(score[(u < low) & ~violation])
+        assert_more_asks_first(score, u)
+
+
+@pytest.mark.parametrize("shown", [lambda r: {"risk": r}, lambda r: {"goal": 1 - r}])
+@pytest.mark.parametrize("risk", [1e-3, 1e-2, 0.2, 1.0])
+def test_thrifty_humans_hand_back_half_of_the_robots_they_agree_with_at_any_chance_of_success(risk, shown):
+    """G may be near 1 for all, where 1 - R stands for it or the critic is sure: its quantiles still tell robots apart."""
+    rng, none = np.random.default_rng(0), jnp.zeros(N, bool)
+    taught = jnp.arange(N) < 6
+    still = {"violation": none, "helped": taught, "given": taught, "correction": jnp.zeros(N), "uncertainty": jnp.ones(N)}
+    steps = []
+    for t in range(100):
+        r = jnp.asarray(rng.uniform(0, risk, N), jnp.float32)
+        s = signals_at(t, **still, **shown(r))
+        steps.append(s if "goal" in shown(r) else s._replace(estimates={"mean_discrepancy": s.estimates["mean_discrepancy"]}))
+    scores = np.stack(scores_of("thrifty_quantile", steps, thrifty_rate=0.05)[20:])
+    assert np.mean(scores[:, :6] > 0) == pytest.approx(0.5, abs=0.15)
+    assert np.mean(scores[:, 6:] > 0) == pytest.approx(0.05, abs=0.03)
+
+
+def test_thrifty_robots_that_ask_are_ordered_by_the_stronger_of_two_reasons():
+    none = jnp.zeros(N, bool)
+    alone = {"violation": none, "helped": none, "given": none, "correction": jnp.zeros(N)}
+    steps = [signals_at(t, uncertainty=jnp.full(N, 0.1), goal=jnp.full(N, 0.5), **alone) for t in range(40)]
+    usual = steps[0]
+    doubt, goal = usual.uncertainty.at[0].set(0.2).at[1].set(0.8), usual.goal.at[2].set(0.25).at[3].set(0.05)
+    last = scores_of("thrifty_quantile", [*steps, signals_at(40, uncertainty=doubt, goal=goal, **alone)])[-1]
+    assert np.argsort(-last)[:4].tolist() == [3, 1, *np.argsort(-last)[2:4]]  # 10 and 8 times as much as usual
+    assert set(np.argsort(-last)[2:4]) == {0, 2}  # twice
+    assert np.all(last[:4] > 0)
 
 
 @pytest.mark.parametrize("has_goal", [True, False])
@@ -192,15 +229,17 @@ def test_lazy_dagger_has_the_bound_of_its_code():
 
 
 def test_dropout_dagger_asks_where_few_samples_are_near_the_human():
-    s = signals_at(0, uncertainty=jnp.linspace(0.0, 0.3, N), violation=jnp.zeros(N, bool))
-    offset = jnp.where(jnp.arange(N) % 2 == 0, 0.0, 0.5)[:, None]
+    s = signals_at(0, uncertainty=jnp.linspace(0.0, 0.3, N).at[2].set(0.005), violation=jnp.zeros(N, bool))
+    offset = jnp.where(jnp.arange(N) % 2 == 0, 0.0, 0.5).at[2].set(0.15)[:, None]
     given = {"dropout_share": 0.5, "dropout_threshold": 0.05}
     (score,) = scores_of("dropout_dagger", [s._replace(human_action=s.robot_action + offset)], **given)
     rng = np.random.default_rng(0)
     noise = np.sqrt(np.asarray(s.uncertainty))[:, None] * rng.normal(size=(20_000, N, ACTIONS))
-    share = np.mean(np.mean((noise - np.asarray(offset)) ** 2, axis=-1) <= 0.05, axis=0)
+    squares = (noise - np.asarray(offset)) ** 2
+    share = np.mean(np.mean(squares, axis=-1) <= 0.05, axis=0)
     clear = np.abs(share - 0.5) > 0.35  # four deviations of 32 samples
     assert clear.sum() >= 6
+    assert np.any(clear & (share > 0.5) & (np.mean(np.sum(squares, axis=-1) <= 0.05, axis=0) < 0.3))  # the mean is, the sum not
     np.testing.assert_array_equal((score > 0)[clear], (share < 0.5)[clear])
 
 
@@ -258,6 +297,7 @@ def test_gates_by_quantiles_of_an_estimate(name, estimate, shift):
         violation = np.asarray(s.violation)
         assert np.all(score[(value > high) | violation] > 0)
         assert not np.any(score[(value < low) & ~violation])
+        assert_more_asks_first(score, value)
         asked += np.sum(score[~violation] > 0)
     assert asked > 0
 
@@ -278,7 +318,11 @@ def test_round_robin_serves_all_in_turn():
         signals = signals._replace(helped=jnp.arange(N) == robot)
     assert served == [*range(N), *range(N)]
     everyone = signals._replace(helped=jnp.ones(N, bool))
-    assert not np.any(rule.score(everyone, memory, jax.random.key(0))[0])
+    score, memory = rule.score(everyone, memory, jax.random.key(0))
+    assert not np.any(score)
+    for waited in range(1, 9):  # its threshold is 5
+        score, memory = rule.score(signals._replace(helped=jnp.zeros(N, bool)), memory, jax.random.key(0))
+        assert np.all((score > 0) == (waited > 5))
 
 
 def test_longest_waiting_is_first_come_first_served():
@@ -331,9 +375,10 @@ def test_whittle_indices(seed):
 
 def test_whittle_counts_transitions_with_and_without_help():
     steps = [signals_at(t) for t in range(6)]
-    config = CONFIG.replace(algorithm="whittle", uncertainty_threshold=0.1, risk_threshold=0.5)
+    config = CONFIG.replace(algorithm="whittle", uncertainty_threshold=0.1, risk_threshold=0.5, whittle_discount=0.9)
+    config = config.replace(whittle_threshold=0.3)
     rule = priority.get_algorithm("whittle").make_priority(config)
-    memory, counts, before = rule.init(), np.ones((2, 3, 3)), None
+    memory, counts, before, below, above = rule.init(), np.ones((2, 3, 3)), None, 0, 0
     counts[0, 2] = 0, 0, 1
     for s in steps:
         score, memory = rule.score(s, memory, jax.random.key(0))
@@ -342,8 +387,13 @@ def test_whittle_counts_transitions_with_and_without_help():
         if before is not None:
             np.add.at(counts, (np.asarray(s.helped).astype(int), before, state), 1)
         np.testing.assert_array_equal(memory.transitions, counts)
-        assert len(np.unique(np.stack([state, score]), axis=1).T) == len(np.unique(state))
+        chains = counts / counts.sum(axis=2, keepdims=True)
+        index = np.array([numpy_index(chains, 0.9, each) for each in range(3)])
+        np.testing.assert_allclose(score, np.where(index > 0.3, index, 0)[state], atol=2e-3)
+        below, above = below + np.sum(index[state] < 0.29), above + np.sum(index[state] > 0.31)
         before = state
+    assert below > 0
+    assert above > 0
 
 
 def numpy_coverage(s, own, bound, number, threshold, link):
@@ -411,7 +461,8 @@ def asa_on(violation, risk, obs, **humans):
     score, _ = algorithm.make_priority(config).score(s, (), jax.random.key(0))
     crew = humans.get("crew", HumanState(jnp.full(2, -1, jnp.int32), jnp.zeros(2, jnp.int32)))
     allocate = algorithm.make_allocate(config)
-    return allocate(score, crew, jnp.full(number, 5), jax.random.key(0), humans.get("available"), s).robot.tolist()
+    key = humans.get("key", jax.random.key(0))
+    return allocate(score, crew, jnp.full(number, 5), key, humans.get("available"), s).robot.tolist()
 
 
 def test_a_violation_is_covered_by_its_own_robot_alone():
@@ -420,6 +471,29 @@ def test_a_violation_is_covered_by_its_own_robot_alone():
     link = jnp.array([0.2, 0.9, 0.9, 0.9])
     assert asa_on([True, False, False, False], [0.0, 0.4, 0.9, 0.5], obs, link=link) == [0, 2]
     assert asa_on([False] * 4, [0.9, 0.4, 0.9, 0.0], obs) == [0, 2]
+
+
+def test_asa_breaks_ties_by_chance():
+    """Three violations alike, far from each other, without uncertainty or risk."""
+    obs, violation = [[0.0], [10.0], [20.0], [30.0]], [True, True, True, False]
+    picked = {tuple(asa_on(violation, [0.0] * 4, obs, key=jax.random.key(i))) for i in range(40)}
+    assert {robot for pair in picked for robot in pair} == {0, 1, 2}
+    assert {pair[0] for pair in picked} == {0, 1, 2}
+
+
+def test_defaults_of_the_rules_are_those_of_their_sources():
+    expected = {
+        "thrifty_quantile": {"thrifty_rate": 0.01},
+        "aim": {"aim_rate": 0.05},
+        "iifl": {"iifl_rate": 0.001},
+        "asa": {"asa_threshold": 0.351, "asa_uncertainty": 0.151, "asa_risk": 0.198},
+        "lazy_dagger": {"lazy_handback": 0.25},
+    }
+    for name, parameters in expected.items():
+        known = fleetjax.make_config("navigation", name).parameters
+        for parameter, value in parameters.items():
+            assert float(known[parameter]) == pytest.approx(value), parameter
+    assert novelty.NEIGHBOURS == 5
 
 
 def test_a_robot_whose_human_has_left_competes_again():
@@ -627,6 +701,48 @@ def test_the_targets_and_the_loss_of_the_proxy_value(monkeypatch):
     expected = np.mean((value(obs, action) + 1) ** 2 + (apart > apart.mean()) * (value(obs, own) - 1) ** 2)
     expected += np.mean((value(now, done) - target) ** 2)
     assert loss_of_update(monkeypatch, parts, state, "intervention", key) == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("environment", ["navigation", "block_push"])
+def test_the_loss_of_the_energy_models(monkeypatch, environment):
+    """Each learns by telling the human's action from proposals; where actions are discrete, these are all of them."""
+    parts, state = taught_fleet("iifl", environment)
+    discrete, data, key = parts.env.spec.discrete, state.human_data, jax.random.key(3)
+    key_pairs, key_actions = jax.random.split(key)
+    draw = np.asarray(buffer.draw_index(key_pairs, (2, 16 // help.FEWER), data.pairs.size))
+    resample = np.asarray(data.resample)
+    assert (resample.shape[1] == 1) == discrete
+    row = np.stack([resample[draw[model], model % resample.shape[1]] for model in range(2)])
+    obs, action = (np.asarray(column)[row] for column in data.pairs.rows)
+    others = []
+    half, actions = help.PROPOSALS // 2, parts.env.spec.action_size
+    near, far = jax.random.split(key_actions)
+    if discrete:
+        others = np.broadcast_to(np.eye(actions), (*row.shape, actions, actions))
+    else:
+        own = np.asarray(parts.learner.predict(state.policy, jnp.asarray(obs))[0])[..., None, :]
+        shape = (*row.shape, half, actions)
+        about = np.clip(own + 0.2 * np.asarray(jax.random.normal(near, shape)), -1, 1)
+        others = np.concatenate([about, jax.random.uniform(far, shape, minval=-1.0)], axis=-2)
+    choices = others if discrete else np.concatenate([action[..., None, :], others], axis=-2)
+    losses = []
+    for model in range(2):
+        params = jax.tree.map(lambda x, model=model: x[model], state.estimators["divergence"].params)
+        scaled = state.policy.normalizer(jnp.asarray(obs[model]))
+        inputs = np.broadcast_to(np.asarray(scaled)[:, None], (*choices[model].shape[:-1], scaled.shape[-1]))
+        energy = energy_of(parts, params, inputs, choices[model])
+        right = np.argmax(action[model], axis=-1) if discrete else np.zeros(len(energy), int)
+        losses += [np.take_along_axis(energy, right[:, None], 1)[:, 0] + np.log(np.exp(-energy).sum(axis=-1))]
+    assert loss_of_update(monkeypatch, parts, state, "divergence", key) == pytest.approx(np.mean(losses), rel=1e-3)
+
+
+def energy_of(parts, params, obs, action) -> np.ndarray:
+    """Return f64[B, P], energies by the network itself where observations are images, else in NumPy."""
+    if not parts.env.spec.image_shape:
+        return numpy_net(parts, params, np.asarray(obs, float), action)
+    network = networks.make_network(parts.env.spec, parts.config.hidden_sizes, 1)
+    both = np.concatenate([obs, action], axis=-1)
+    return np.asarray(network.apply(params, jnp.asarray(both, jnp.float32))[..., 0], float)
 
 
 def numpy_jeffreys(energies) -> np.ndarray:

@@ -191,6 +191,71 @@ def test_noise_and_mistakes():
     assert not np.any(done[:, 2:])
 
 
+def test_takeovers_of_one_human_spread_as_its_own_spread_says():
+    found, aux = model(takeover_time=20.0, takeover_spread=(0.0, 0.5, 1.0))
+    act, waits = compiled(found.act), []
+    for t in range(400):  # each human goes to another robot every timestep
+        aux, _, _ = act(aux, planned(t % 2, 2 + t % 2, 4 + t % 2), jnp.zeros((N, A)), jax.random.key(t))
+        waits.append(np.asarray(aux.wait))
+    spread = np.std(waits, axis=0) / 20
+    assert spread[0] == 0
+    assert spread[1] == pytest.approx(0.5, abs=0.15)
+    assert spread[2] > 0.65
+
+
+def test_each_human_has_its_own_lag_fatigue_and_absence_time():
+    found, aux = model(switching_lag=(2.0, 0.0, 4.0))
+    _, given, _ = follow(found, aux, [planned(0, 1, 2)] * 2 + [planned(3, 4, 5)] * 6)
+    assert [int(np.argmax(given[2:, robot])) for robot in (3, 4, 5)] == [2, 0, 4]
+    found, aux = model(takeover_time=3.0, takeover_spread=0.0, fatigue=(0.0, 1.0, 2.0), action_noise=0.1)
+    tired = aux._replace(busy=jnp.ones(M))
+    done, given, _ = follow(found, tired, [planned(0, 1, 2)] * 400, [jnp.zeros((N, A))] * 400)
+    assert [int(np.argmax(given[:, robot])) for robot in (0, 1, 2)] == [3, 6, 9]
+    np.testing.assert_allclose(
+        done[10:, :3].std(axis=(0, 2)), 0.1 * np.array([1, 1.84, 2.68]), rtol=0.2
+    )  # busy on average 0.84
+    found, aux = model(absence=0.5, absence_time=(4.0, 40.0, 400.0))
+    act, changes, before = compiled(found.act), np.zeros(M), aux.away
+    for t in range(1500):
+        aux, _, _ = act(aux, planned(-1, -1, -1), jnp.zeros((N, A)), jax.random.key(t))
+        changes, before = changes + np.asarray(before != aux.away), aux.away
+    assert changes[0] > 3 * changes[1] > 9 * max(changes[2], 1)
+
+
+def test_humans_with_their_own_values_are_swept_together():
+    """A tuple of arrays: values for each human, and a leading axis of configurations."""
+
+    def waits(scale):
+        found, aux = model(takeover_time=(0.0 * scale, 2.0 * scale, 4.0 * scale), takeover_spread=0.0)
+        return found.act(aux, planned(5, 3, 1), jnp.zeros((N, A)), jax.random.key(0))[0].wait
+
+    np.testing.assert_array_equal(jax.vmap(waits)(jnp.array([1.0, 3.0])), [[0, 2, 4], [0, 6, 12]])
+
+
+def test_who_is_there_and_what_they_do_are_drawn_apart(monkeypatch):
+    keys = {}
+
+    def make(config, spec):
+        found = humans.HUMAN_MODELS.get("imperfect")(config, spec)
+
+        def available(aux, key):
+            keys["available"] = key
+            return found.available(aux, key)
+
+        def act(aux, plan, action, key):
+            keys["act"] = key
+            return found.act(aux, plan, action, key)
+
+        return found._replace(available=available, act=act)
+
+    monkeypatch.setitem(humans.HUMAN_MODELS.entries, "watched", make)
+    config = fleetjax.make_config("navigation", human_model="watched", **SMALL)
+    state = compiled(fleetjax.prepare)(config, jax.random.key(0))
+    with jax.disable_jit():
+        make_fleet(config, envs.make("navigation")).step(state, jax.random.key(1))
+    assert not np.array_equal(*(jax.random.key_data(keys[part]) for part in ("available", "act")))
+
+
 def test_fatigue_grows_with_work_and_lengthens_takeovers():
     found, aux = model(fatigue=1.0, takeover_time=4.0, takeover_spread=0.0)
     _, given, fresh = follow(found, aux, [planned(0, -1, -1)] * 200)
@@ -357,6 +422,16 @@ def test_a_file_holds_a_value_for_each_human(tmp_path, capsys):
         ),
         ({"action_noise": (0.1,) * 9 + (-0.1,)}, "action_noise = -0.1.* must be at least 0"),
         ({"absence": 1.0}, "absence = 1.0 must be in"),
+        (
+            {"absence": 0.9, "absence_time": 8.0},
+            "absence_time = 8.0 is too short for absence = 0.9, .*make it at least 9, or lower absence",
+        ),
+        (
+            {"num_humans": 2, "absence": (0.0, 0.98), "absence_time": (1.0, 10.0)},
+            "absence_time = 10.0 is too short for absence = 0.98, .* at least 49,",
+        ),
+        ({"link_failure_rate": 0.5, "link_model": "unequal"}, "link_failure_rate has no effect with link_model = 'unequal'"),
+        ({"link_repair_rate": 0.5, "link_model": "perfect"}, "link_repair_rate has no effect with link_model = 'perfect'"),
         ({"action_delay": 11.0}, "action_delay = 11.0 must be in"),
         ({"human_model": "imperfet"}, "human_model = 'imperfet' is unknown; the closest are imperfect"),
         ({"link_model": "good"}, "link_model = 'good' is unknown"),
@@ -366,6 +441,34 @@ def test_a_file_holds_a_value_for_each_human(tmp_path, capsys):
 def test_bad_input_is_refused(parameters, message):
     with pytest.raises(ValueError, match=message):
         fleetjax.make_config("navigation", **parameters)
+
+
+def test_the_largest_absence_is_allowed_and_what_is_just_possible():
+    assert float(fleetjax.make_config("navigation", absence=0.99).absence) == pytest.approx(0.99)
+    fleetjax.make_config("navigation", absence=0.9, absence_time=9.0)
+
+
+def test_a_rate_of_links_chooses_their_model():
+    assert fleetjax.make_config("navigation", link_failure_rate=0.2).link_model == "gilbert_elliott"
+    assert fleetjax.make_config("navigation", "cur").link_model == "perfect"
+
+
+@pytest.mark.parametrize(("name", "remedy"), [("takeover_time", "use a tuple"), ("uncertainty_threshold", "use jax.vmap")])
+def test_several_values_without_vmap_are_refused(name, remedy):
+    config = fleetjax.make_config("navigation", **{name: np.array([1.0, 2.0, 3.0])})
+    with pytest.raises(ValueError, match=rf"{name} has shape \(3,\), but a run has one value.*{remedy}"):
+        fleetjax.run(config, jax.random.key(0))
+
+
+def test_only_one_value_for_all_humans_is_calibrated_or_differentiated(tmp_path, capsys):
+    path = tmp_path / "times.txt"
+    path.write_text("1 2 3")
+    given = ["--num-humans", "3", "--takeover-time", f"@{path}", "--field", "takeover_time", "--human-time", "500"]
+    assert "takeover_time has a value for each human" in refused(capsys, "calibrate", "navigation", *given)
+    config = fleetjax.make_config("navigation", num_humans=3, takeover_time=(1.0, 2.0, 3.0))
+    for width in (None, 0.1):
+        with pytest.raises(ValueError, match="takeover_time has a value for each human"):
+            fleetjax.sensitivity(config, jax.random.key(0), ["takeover_time"], method="smoothed", width=width)
 
 
 def test_a_changed_configuration_is_checked():

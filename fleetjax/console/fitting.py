@@ -114,7 +114,7 @@ def _lognormal(times: list[Takeover]) -> tuple[float, float]:
     deviation is at most `WIDEST`.
     """
     ends = [(max(one.time - 0.5, 0.0), one.time + 0.5) for one in times if one.acted]
-    longer = [float(one.time) for one in times if not one.acted]
+    longer = [one.time - 0.5 for one in times if not one.acted]  # the last timestep of this help would be `time - 1`
     if max(high for _, high in ends) <= 0.5 and not longer:
         return 0.0, FIELDS["takeover_spread"].default  # all acted at once
     with np.errstate(divide="ignore"):  # the search may try a distribution that excludes a time

@@ -82,7 +82,8 @@ def operator(session: Session, view: View, number: int, seat: Seat, pictures: Ma
     robot = seat.robot
     content: dict[str, Any] = {"type": "state", "tick": view.timestep, "steps": session.config.num_steps, "robot": robot}
     if robot < 0:
-        return content | {"mode": "free"}
+        waiting = bool(np.any(view.violation))
+        return content | {"mode": "free", "resets_begin": _resets_begin(session.config, view.timestep) if waiting else -1}
     config, done = session.config, int(view.duration[number])
     signals = _signals(session, view, robot)
     needed = int(config.hard_reset_time if seat.resetting else config.min_teleop_time)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleetjax.config import Config, all_fields, get_value
+from fleetjax.config import Config, all_fields, check_one_for_all, get_value
 from fleetjax.io import files, folder, resumable, text
 from fleetjax.io.progress import say
 from fleetjax.search import Scale, solve
@@ -81,6 +81,7 @@ def check(request: Request) -> None:
     if field is None or not field.traced or field.kind is not float:
         real = ", ".join(name for name, other in known.items() if other.traced and other.kind is float)
         raise ValueError(f"field = {request.field!r} must be a real-valued traced field; choose one of {real}")
+    check_one_for_all(request.config, request.field)
     largest = request.config.num_humans * request.config.num_steps
     if not 0 < request.human_time < largest:
         raise ValueError(

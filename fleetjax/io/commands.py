@@ -33,6 +33,7 @@ from fleetjax.io import (
     text,
 )
 from fleetjax.io.errors import Refusal
+from fleetjax.io.parameters import IN_CONSOLE
 from fleetjax.io.progress import progress, say
 from fleetjax.metrics import Metrics
 from fleetjax.priority import get_algorithm, list_algorithms
@@ -124,8 +125,8 @@ def _config(arguments: argparse.Namespace, given: Mapping[str, Any]) -> Config:
         resume = ", or resume a run with --resume RUN" if arguments.command == "run" else ""
         raise ValueError(f"ENV is missing; choose one of {', '.join(known)}{resume}")
     overrides = {name: value for name, value in given.items() if name not in ("environment", "algorithm")}
-    if arguments.command == "console":  # a person who is free is asked at once
-        overrides = {"initial_period": 0} | overrides
+    if arguments.command == "console":
+        overrides = {**IN_CONSOLE, **overrides}
     config = make_config(given["environment"], given.get("algorithm", "cur"), **overrides)
     check_run(config)
     return config

@@ -11,7 +11,7 @@ from fleetjax.environments import list_envs
 from fleetjax.io.errors import Refusal
 from fleetjax.io.formats import FORMATS
 from fleetjax.io.lists import listed
-from fleetjax.io.parameters import add_parameters, integer, number, seed
+from fleetjax.io.parameters import IN_CONSOLE, add_parameters, integer, number, seed
 from fleetjax.registry import unknown
 from fleetjax.version import VERSION
 
@@ -356,4 +356,4 @@ def _add_console(commands: Any, environment: str | None) -> None:
     console.add_argument("--seed", metavar="N", type=seed, help="random seed [default: 0]")
     console.add_argument("--output", metavar="DIR", type=Path, help="run folder [default: a new one below runs/]")
     console.add_argument("--overwrite", action="store_true", help="replace the run in an existing folder")
-    add_parameters(console, environment, short={"num_humans": "--humans"})
+    add_parameters(console, environment, short={"num_humans": "--humans"}, defaults=IN_CONSOLE)

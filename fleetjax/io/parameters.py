@@ -12,6 +12,7 @@ from fleetjax.field import FIELDS, OF_LINKS, Field, every_field, owners_in_words
 from fleetjax.io.lists import listed, sizes
 
 LARGEST_SEED = 2**32 - 1  # JAX folds larger ones onto these
+IN_CONSOLE = MappingProxyType({"initial_period": 0})  # its own defaults: a person who is free is asked at once
 _LARGEST = 2**31 - 1
 
 
@@ -21,27 +22,34 @@ def add_parameters(
     short: Mapping[str, str] = MappingProxyType({}),
     *,
     with_lists: bool = False,
+    defaults: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
-    """Add a flag for each field of `Config`, with a short form for some, and for each parameter of an algorithm."""
+    """Add a flag for each field of `Config`, and for each parameter of an algorithm.
+
+    Args:
+        command: that gets the flags.
+        environment: whose defaults are shown; None = those of all.
+        short: second flags of some fields.
+        with_lists: take several values, separated by commas.
+        defaults: of this command, where they are not the environment's.
+    """
     add = _add_list if with_lists else _add_field
     fields = command.add_argument_group(f"parameters{f' (defaults of {environment})' if environment else ''}")
     people = command.add_argument_group("humans and links (@FILE: a number for each human)")
     own = command.add_argument_group("parameters of one algorithm each")
     for name, field in every_field().items():
-        if name in FIELDS and name != "environment":
-            add(
-                people if field.per_human or name in OF_LINKS else fields,
-                name,
-                field,
-                environment,
-                *([short[name]] if name in short else []),
-            )
-        elif name not in FIELDS:
-            add(own, name, field._replace(help=f"{owners_in_words(name)}: {field.help}"), environment)
+        if name == "environment":
+            continue
+        default = show(defaults[name]) if name in defaults else _default(name, field, environment)
+        if name in FIELDS:
+            group = people if field.per_human or name in OF_LINKS else fields
+            add(group, name, field, default, *([short[name]] if name in short else []))
+        else:
+            add(own, name, field._replace(help=f"{owners_in_words(name)}: {field.help}"), default)
 
 
-def _add_field(group: Any, name: str, field: Field, environment: str | None, *short: str) -> None:
-    options: dict[str, Any] = {"default": argparse.SUPPRESS, "help": _help(name, field, environment)}
+def _add_field(group: Any, name: str, field: Field, default: str, *short: str) -> None:
+    options: dict[str, Any] = {"default": argparse.SUPPRESS, "help": _help(field, default)}
     if field.kind is bool:
         options |= {"action": argparse.BooleanOptionalAction}
     elif field.kind is tuple:
@@ -51,9 +59,9 @@ def _add_field(group: Any, name: str, field: Field, environment: str | None, *sh
     group.add_argument(_flag(name), *short, **options)
 
 
-def _add_list(group: Any, name: str, field: Field, environment: str | None) -> None:
+def _add_list(group: Any, name: str, field: Field, default: str) -> None:
     """Add a flag that takes several values of a parameter, separated by commas, in place of one."""
-    options: dict[str, Any] = {"default": argparse.SUPPRESS, "help": _help(name, field, environment)}
+    options: dict[str, Any] = {"default": argparse.SUPPRESS, "help": _help(field, default)}
     if field.kind is tuple:
         options |= {"action": sizes(integer), "nargs": "+", "metavar": "N"}
     else:
@@ -69,9 +77,9 @@ def _flag(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-def _help(name: str, field: Field, environment: str | None) -> str:
+def _help(field: Field, default: str) -> str:
     unit = f" ({field.unit})" if field.unit else ""
-    return f"{field.help}{unit} [default: {_default(name, field, environment)}]".replace("%", "%%")
+    return f"{field.help}{unit} [default: {default}]".replace("%", "%%")
 
 
 def _default(name: str, field: Field, environment: str | None) -> str:

@@ -8,6 +8,7 @@ import contextlib
 import itertools
 import re
 import tomllib
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,6 +28,7 @@ from fleetjax.registry import unknown
 Block = Mapping[str, list[Any]]
 Group = tuple[folder.Run, ...]  # completed together by one process
 _MOST_SEEDS = 100_000
+_LONGEST_LIST = 10  # values of one parameter that a folder's name spells out
 _LEASE = 180  # seconds; NFS shows others' files with up to 60 s delay
 _MINUTES = 24 * 60  # of a job
 _SHORTEST = 15  # minutes; of which the scheduler's warning takes the last ones
@@ -337,4 +339,8 @@ def _name(run: _Planned, varied: Sequence[str]) -> str:
 def _written(value: Any) -> str:
     if isinstance(value, bool):
         return "on" if value else "off"
-    return "x".join(map(str, value)) if isinstance(value, list) else str(value)
+    if not isinstance(value, list):
+        return str(value)
+    if len(value) > _LONGEST_LIST:  # names of folders have limits
+        return f"{len(value)}_values_{zlib.crc32(repr(value).encode()):08x}"
+    return "x".join(map(str, value))

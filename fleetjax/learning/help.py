@@ -116,7 +116,8 @@ def make_intervention(config: Config, env: Env, learner: Learner, supervisor: Su
     """Proxy value of the robot's action: -1 where a human did it, +1 where a human would correct it.
 
     On human data Q(o, a_h) is drawn to -1, and Q(o, a_r) to +1 where mean (a_r - a_h)^2 is above its mean in the batch. On the
-    fleet's transitions Q(o, a) is drawn to `goal_discount` Q'(o', policy(o')), or 0 after a violation or success.
+    fleet's transitions Q(o, a) is drawn to `goal_discount` Q'(o', policy(o')), or 0 after a violation or success. The original
+    has the maximum over actions in place of the policy's action.
 
     Reference: Adaptive Intervention Mechanism (AIM), 2025; reimplemented from the text. Its two episodes of warm-up are
     `critic_pretraining_steps` gradient steps on the demonstrations.
@@ -177,7 +178,8 @@ def make_divergence(config: Config, env: Env, learner: Learner, supervisor: Supe
     """Jeffreys divergence of two energy models of the human's action: sum_a (p_1 - p_2) (log p_1 - log p_2).
 
     p_k(a) is the softmax of -E_k(o, a) over proposed actions: half of them about the robot's action, half anywhere. Each model
-    learns by telling the human's action from proposals (InfoNCE), on its own bootstrap of the human data.
+    learns by telling the human's action from proposals (InfoNCE), on its own bootstrap of the human data where the policy is
+    an ensemble, else on the same. The original samples actions from each model's own distribution.
 
     Reference: Datta et al., IIFL, 2023; Florence et al., Implicit behavioral cloning, 2021.
     """

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from fleetjax import sharding
-from fleetjax.allocation import Allocator, allocate, is_bound
+from fleetjax.allocation import Allocator, allocate, is_bound, tie_order
 from fleetjax.field import PARAMETERS
 from fleetjax.priority.base import Algorithm, Priority, stateless
 from fleetjax.priority.gates import known
@@ -19,9 +19,10 @@ NEARNESS = 4.89  # how fast similarity falls with distance
 def asa(config) -> Priority:
     """Score what each robot gains from being helped itself, for the allocator `by_coverage`: 0.097 U + 0.903 R + 10,000 C.
 
-    U and R count as 0 below `asa_uncertainty` and `asa_risk`; their defaults are those of the published code, which were
-    tuned to its own ensemble and critic. In the initial period robots in violation score 0, and nobody helps them; the
-    original subtracts 10,000 there, but may still pick such a robot for the sake of its neighbours.
+    U and R count as 0 below `asa_uncertainty` and `asa_risk`. Their defaults and the other numbers are those of the published
+    code's settings file, tuned to its own ensemble and critic; its scripts have others for each robot. In the initial period
+    robots in violation score 0, and nobody helps them. It is `initial_period`; the original's is 2,000 timesteps, in which it
+    subtracts 10,000, but may still pick such a robot for the sake of its neighbours.
 
     Reference: Akcin et al., Fleet supervisor allocation: a submodular maximization approach (ASA), 2024, and its published
     code.
@@ -47,6 +48,7 @@ def similarity(obs: jax.Array) -> jax.Array:
     """Return f32[N, N], 1 / (1 + 4.89 d) for the root mean squared distance d of observations f32[N, O].
 
     Observations are scaled by the fleet's own mean and deviation at this timestep, so that no unit counts more than another.
+    The published code mixes similarities of states and of actions, and its settings give nearly all weight to actions.
     """
     deviation = jnp.std(obs, axis=0)
     scaled = known((obs - jnp.mean(obs, axis=0)) / jnp.where(deviation > 1e-6, deviation, 1.0))
@@ -83,12 +85,13 @@ def by_coverage(config) -> Allocator:
         bound = sharding.put(jnp.zeros(n, bool), jnp.where(stays, humans.robot, n), True)
         covered = jnp.max(jnp.where(bound[None], covers, 0.0), axis=1)
         link = jnp.ones(n, jnp.float32) if signals.link is None else signals.link
+        places = tie_order(key, n)
 
         def pick(carry: tuple[jax.Array, jax.Array, jax.Array], turn: jax.Array):
             covered, order, left = carry
             gain = jnp.sum(jnp.maximum(covers - covered[:, None], 0.0), axis=0) * link
             gain = jnp.where(left, gain, -1.0)
-            best = jnp.argmax(gain)
+            best = places[jnp.argmax(gain[places])]  # ties are broken by chance
             good = gain[best] >= config.parameters["asa_threshold"]
             order = order.at[jnp.where(good, best, n)].set(turn, mode="drop")
             covered = jnp.where(good, jnp.maximum(covered, covers[:, best]), covered)

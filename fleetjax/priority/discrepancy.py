@@ -22,9 +22,10 @@ def distance(signals) -> jax.Array:
 def safe_dagger(config) -> Priority:
     """Ask if P(d > tau) >= `safe_threshold`, for the difference d = mean (a_r - a_h)^2 of actions and tau = `discrepancy_tau`.
 
-    P is the `"discrepancy"` classifier's.
+    P is the `"discrepancy"` classifier's. It learns from all human data, as the policy does, so it sees smaller differences
+    than on new states; LazyDAgger's published code keeps a part of the data from the policy.
 
-    The default tau, 0.0025, is fleetjax's.
+    The default tau is 0.0025 per dimension.
 
     Reference: Zhang and Cho, SafeDAgger, 2017; reimplemented from the text.
     """
@@ -59,10 +60,11 @@ def of_lazy_dagger(config) -> Mapping[str, Any]:
 
 
 def dropout_dagger(config) -> Priority:
-    """Ask if p < `dropout_share`, where p is the share of sampled actions within `dropout_threshold` of the human's.
+    """Ask if p < `dropout_share`, for the share p of sampled actions a with mean (a - a_h)^2 <= `dropout_threshold`.
 
     As in the original, the rule needs the human's action before it asks, so it cannot be used on real fleets. Samples come from
-    a normal distribution with the ensemble's mean and variance; the original samples networks with dropout.
+    a normal distribution with the ensemble's mean and, in every dimension, its mean variance U; the original samples networks
+    with dropout. Where actions are discrete, U is an entropy, and the noise on one-hot actions is only a rough stand-in.
 
     Reference: Menda et al., DropoutDAgger, 2017; reimplemented from the text.
     """

@@ -25,7 +25,8 @@ def crsail(config) -> Priority:
     """Ask if d_K / r >= `crsail_threshold`, for the distance d_K to the K-th nearest state in which humans acted.
 
     The radius r is the quantile at level 1 - `crsail_rate` of the same distance among the demonstrated states, calibrated
-    once, before the fleet starts. See the estimator `"novelty"`.
+    once, before the fleet starts. See the estimator `"novelty"`. In the original the quantile is that of distances which
+    the policy itself met, so that its level sets the rate of queries; here the threshold does.
 
     Reference: CRSAIL, 2025 (arXiv 2512.00453: K = 5); reimplemented from the text.
     """
@@ -43,12 +44,13 @@ class Interval(NamedTuple):
 def conformal(config) -> Priority:
     """Ask if the interval of the human's action is wider than `conformal_threshold`: 2 q s, with the ensemble's spread s.
 
-    Only labels move q. After a timestep in which humans taught robots, q is multiplied by exp(`conformal_gain` (e -
-    `conformal_rate`)), where e is the share of these robots whose residual was beyond q s. All labels have the same
-    probability p, so their weights 1 / p cancel, and e is a plain mean.
+    s = sqrt(U) + 0.001, and q is 1 at first. Only labels move q. After a timestep in which humans taught robots, q is
+    multiplied by exp(`conformal_gain` (e - `conformal_rate`)), where e is the share of these robots whose residual, the root
+    mean squared difference of the two actions, was beyond q s. Robots that are then in violation do not count.
 
     Reference: ConformalDAgger with intermittent quantile tracking, 2024 (arXiv 2410.08852); reimplemented from the text. The
-    original has one robot. Here the spread s differs between robots, and q changes by a factor.
+    original has one robot, and weighs a label by 1 / p, for its probability p. Here labels come from robots that are helped,
+    their weights are equal, s differs between robots, and q changes by a factor. Where actions are discrete, U is an entropy.
     """
     own = config.parameters
 
@@ -73,9 +75,10 @@ def aim(config) -> Priority:
     """Ask if the proxy value of the robot's action is above its running quantile at level 1 - `aim_rate`.
 
     The value is learnt to be -1 for humans' actions and +1 for those of robots that humans would correct, and spreads to
-    the states before by temporal differences. See the estimator `"intervention"`.
+    the states before by temporal differences. See the estimator `"intervention"`. The quantile forgets within 1,000 timesteps.
 
-    Reference: Adaptive Intervention Mechanism (AIM), 2025; reimplemented from the text (delta = 0.05).
+    Reference: Cai, Peng and Zhou, Adaptive Intervention Mechanism (AIM), 2025 (arXiv 2506.09176); reimplemented from the text
+    (delta = 0.05).
     """
     shift = 1.0  # values lie about [-1, 1], and quantiles are of numbers above 0
     return _at_a_rate(lambda signals: jnp.maximum(known(signals.estimates["intervention"]) + shift, 0.0), config, "aim_rate")
@@ -85,9 +88,10 @@ def iifl(config) -> Priority:
     """Ask if the Jeffreys divergence of two energy models is above its running quantile at level 1 - `iifl_rate`.
 
     Only this uncertainty comes from energy models (the estimator `"divergence"`); the robots still act by the regression
-    ensemble.
+    ensemble. The quantile forgets within 1,000 timesteps, and is over robots that move on their own.
 
-    Reference: Datta et al., IIFL, 2023 (Section 4, and the published code: the 99.9th percentile of the last 1 000 steps).
+    Reference: Datta et al., IIFL, 2023 (Section 4, and the published code, where the threshold is fixed, or, as an option, the
+    99.9th percentile over all robots of the last 1,000 steps).
     """
     return _at_a_rate(lambda signals: known(signals.estimates["divergence"]), config, "iifl_rate")
 

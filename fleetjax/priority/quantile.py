@@ -17,7 +17,8 @@ def quantile_ensemble(config) -> Priority:
     The quantile forgets within `quantile_memory` timesteps. With `quantile_calibration` = t > 0 it stays as it is from
     timestep t on; with 0 it is always refitted.
 
-    Reference: EnsembleDAgger (Menda et al. 2019) thresholds the variance; the quantile in its place is that of ThriftyDAgger.
+    Reference: EnsembleDAgger (Menda et al. 2019) thresholds the variance, and the difference from the human's action, which a
+    fleet does not know before it asks. Reimplemented from the text, with ThriftyDAgger's quantile in place of the threshold.
     """
     own = config.parameters
 
@@ -39,11 +40,16 @@ class Past(NamedTuple):
 
     Attributes:
         doubt: Histogram of uncertainties.
-        chance: Histogram of chances of success.
+        odds: Histogram of the roots of the odds of success.
     """
 
     doubt: Histogram
-    chance: Histogram
+    odds: Histogram
+
+
+def root_odds(chance: jax.Array) -> jax.Array:
+    """Return sqrt(G / (1 - G)): bins on a logarithmic scale are as narrow near G = 1 as near 0."""
+    return jnp.sqrt(chance / jnp.maximum(1.0 - chance, 1e-12))
 
 
 def thrifty_quantile(config) -> Priority:
@@ -51,8 +57,9 @@ def thrifty_quantile(config) -> Priority:
 
     q are running quantiles over robots that move on their own. They forget within `thrifty_memory` timesteps, where the
     original refits them after each episode. The mean is the current policy's mean squared difference from the
-    human actions, over a batch of all human data (the estimator `"mean_discrepancy"`). G is the goal critic's chance of
-    success; where the environment has no goals, 1 - R. Robots that ask are ordered by max(U / q_U, q_G / G).
+    human actions, over a batch of all human data (the estimator `"mean_discrepancy"`); the original computes it once, after
+    cloning, over all demonstrations. G is the goal critic's chance of success, with the discount `goal_discount`, 0.999 (in
+    the original 0.9999); where the environment has no goals, it is 1 - R. Robots that ask are ordered by max(U / q_U, q_G / G).
 
     Reference: Hoque et al., ThriftyDAgger, 2021 (Section 4, and the published code: a = 0.01). Its start values 0.48 and
     0.495 are not used: the first timestep gives the first quantiles.
@@ -67,12 +74,14 @@ def thrifty_quantile(config) -> Priority:
         has_goal = "goal" in signals.estimates
         doubt, chance = known(signals.uncertainty), known(signals.goal if has_goal else 1.0 - signals.risk)
         alone, taught = on_their_own(signals), teleoperated(signals)
-        past = Past(add(past.doubt, doubt, alone, memory), add(past.chance, chance, alone, memory))
-        most, least = quantile(past.doubt, 1.0 - rate), quantile(past.chance, rate)
-        asks = (doubt > most) | (chance < least)
-        urgency = jnp.maximum(doubt / jnp.maximum(most, 1e-6), least / jnp.maximum(chance, 1e-6))
+        odds = root_odds(chance)
+        past = Past(add(past.doubt, doubt, alone, memory), add(past.odds, odds, alone, memory))
+        most, least = quantile(past.doubt, 1.0 - rate), quantile(past.odds, rate)
+        asks = (doubt > most) | (odds < least)
+        least_chance = least**2 / (1.0 + least**2)
+        urgency = jnp.maximum(doubt / jnp.maximum(most, 1e-6), least_chance / jnp.maximum(chance, 1e-6))
         agrees = signals.correction < signals.estimates["mean_discrepancy"]
-        keeps = taught & ~(agrees & (chance > quantile(past.chance, 0.5)))
+        keeps = taught & ~(agrees & (odds > quantile(past.odds, 0.5)))
         return gated(signals, jnp.where(asks, urgency, 0.0), keeps), past
 
     return Priority(init, score)

@@ -27,7 +27,8 @@ def indices(passive: jax.Array, active: jax.Array, discount: jax.Array) -> jax.A
         active: f32[3, 3] the same with help.
         discount: f32[] of the next timestep.
 
-    A policy's value is linear in the price, so that the best of the eight policies is found for every price at once.
+    A policy's value is linear in the price, so that the best of the eight policies is found for every price at once. Rounding
+    to 32 bits moves an index by up to 0.002 at a discount of 0.99, and by much more above.
     """
     worth, helps = jnp.array(WORTH), jnp.asarray(POLICIES, jnp.float32)
     chains = jnp.where(helps[:, :, None] > 0, active, passive)

@@ -107,7 +107,9 @@ function update(message) {
   if (!sameHelp) letGo(); // what is held was meant for another robot
   for (const button of buttons.values()) button.classList.remove("sent");
   show(message);
-  if (message.mode === "free") say("Not your turn: no robot needs you now.");
+  if (message.mode === "free" && message.resets_begin >= 0)
+    say(`Not your turn: some robots are stuck, but resets begin at timestep ${message.resets_begin}.`);
+  else if (message.mode === "free") say("Not your turn: no robot needs you now.");
   else if (message.mode === "drive") say(`Your turn: ${facts.verb} robot ${message.robot}.`);
   else if (message.confirmed) say(`Robot ${message.robot} is being reset.`);
   else say(`Your turn: robot ${message.robot} is stuck. Reset it: press R, or the red button.`);

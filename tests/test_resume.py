@@ -165,6 +165,31 @@ def test_any_chunk_length_and_any_stop_give_the_same_bits(tmp_path, monkeypatch,
     assert_same(path, whole)
 
 
+@pytest.mark.slow
+def test_imperfect_people_and_links_are_in_the_checkpoint(tmp_path, monkeypatch):
+    times = tmp_path / "times.txt"
+    times.write_text("1.5 4")  # TINY has two humans
+    people = (
+        "--takeover-time",
+        f"@{times}",
+        "--absence",
+        "0.3",
+        "--absence-time",
+        "9",
+        "--fatigue",
+        "2",
+        "--action-delay",
+        "2",
+    )
+    given = (*RUN, *people, "--action-noise", "0.2", "--link-model", "swapping")
+    assert run_here(*given, "--output", tmp_path / "whole") == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(resumable, "progress", interrupt_after(20))
+        assert run_here(*given, "--output", tmp_path / "stopped", "--checkpoint-every", 15) == 130
+    assert run_here("run", "--resume", tmp_path / "stopped") == 0
+    assert_same(tmp_path / "stopped", tmp_path / "whole")
+
+
 def test_metrics_behind_the_checkpoint_are_cut_off(stopped, whole, capsys):
     shutil.rmtree(stopped / checkpoint.FOLDER / "0000000066")
     folder.write_config(folder.read_run(stopped), sealed=False)  # as a kill leaves it

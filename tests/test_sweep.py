@@ -62,6 +62,19 @@ def test_a_sweep_is_the_product_of_its_lists_and_names_say_what_differs():
     assert list(planned("navigation", "--seed", "7,3")) == ["navigation-cur-seed7", "navigation-cur-seed3"]
 
 
+def test_folders_of_many_values_have_short_names_of_their_own(tmp_path):
+    for name, last in (("one", 1.5), ("other", 2.5)):
+        (tmp_path / name).write_text(" ".join(["12.5"] * 59 + [str(last)]))
+    lists = f"@{tmp_path / 'one'},@{tmp_path / 'other'},5"
+    names = list(planned("navigation", "--num-robots", 60, "--num-humans", 60, "--takeover-time", lists))
+    assert len(set(names)) == 3
+    assert all(len(name) < 100 for name in names)
+    assert [name.split("=")[1][:9] for name in names] == ["60_values", "60_values", "5.0-seed0"]
+    (tmp_path / "two").write_text("1 2")
+    names = list(planned("navigation", "--num-humans", 2, "--takeover-time", f"@{tmp_path / 'two'},5"))
+    assert names == ["navigation-cur-takeover_time=1.0x2.0-seed0", "navigation-cur-takeover_time=5.0-seed0"]
+
+
 def test_a_parameter_of_one_algorithm_is_given_to_it_alone():
     runs = planned("navigation", "--algorithm", "cur,random", "--random-threshold", "0.5,0.75")
     names = ["navigation-cur-seed0", "navigation-random-random_threshold=0.5-seed0"]

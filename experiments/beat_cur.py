@@ -5,8 +5,8 @@
 
 A variant helps moving robots up to timestep T, chosen in some way. It resets robots before it helps others (`first`), after
 that (`last`), or not at all up to T / 2 and then first (`half`). Variants whose name begins with `teach` are Teach First with
-one thing changed; give them `--teaching-time` instead of T. Parameters of `fleetjax run` may follow after `--`. Prints a row
-for each run.
+one thing changed; give them `--teaching-time` after `--` instead of T (5,500 by default). Other parameters of `fleetjax run`
+may follow there, too. Prints a row for each run.
 """
 
 import argparse
@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 
 import fleetjax
+from fleetjax.config import all_fields
 from fleetjax.field import Field
 from fleetjax.io import scripts, text
 from fleetjax.io.lists import listed
@@ -138,15 +139,16 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=100)
     parser.add_argument("--until", type=float, help="T [default: one for each environment]")
     args, given = scripts.parse(parser)
-    known = (*VARIANTS, *LESSONS)
-    if unknown := [name for name in args.variants if name not in known]:
-        parser.error(f"unknown variants: {', '.join(unknown)}; choose from {', '.join(known)}")
+    names = (*VARIANTS, *LESSONS)
+    if unknown := [name for name in args.variants if name not in names]:
+        parser.error(f"unknown variants: {', '.join(unknown)}; choose from {', '.join(names)}")
     register()
     print("| environment | variant | successes | violations | human time | idle time |\n|---|---|---:|---:|---:|---:|")
     for environment in args.environments:
         for name in args.variants:
             own = {"help_until": UNTIL[environment] if args.until is None else args.until} if name in VARIANTS else {}
-            settings = {"initial_period": 0} | own | given
+            known = all_fields(name)
+            settings = {"initial_period": 0} | own | {field: value for field, value in given.items() if field in known}
             config = fleetjax.make_config(environment, name, **settings)
             totals = jax.tree.map(lambda x: int(x.sum()), fleetjax.run(config, jax.random.key(args.seed)).metrics)
             counts = (totals.successes, totals.violations, totals.human_steps, totals.idle)

@@ -144,10 +144,11 @@ def main() -> None:
     args = parser.parse_args()
     args.results.mkdir(parents=True, exist_ok=True)
     sweep.leave_gpus_to_workers()  # so policies are evaluated on the CPU
-    for part in [Part(name, args) for name in args.parts]:
-        if not args.rows_only:
-            part.evaluate(Part(TRAINED, args)) if part.name == "policies" else part.run()
-        part.show()
+    with files.lock(args.results):  # another process would lose the rows that this one stores
+        for part in [Part(name, args) for name in args.parts]:
+            if not args.rows_only:
+                part.evaluate(Part(TRAINED, args)) if part.name == "policies" else part.run()
+            part.show()
 
 
 if __name__ == "__main__":

@@ -151,11 +151,12 @@ def main() -> None:
     args = parser.parse_args()
     args.results.mkdir(parents=True, exist_ok=True)
     sweep.leave_gpus_to_workers()
-    for part in [Part(f"people_{name}", args) for name in args.environments]:
-        if not args.rows_only:
-            part.run()
-        if part.rows():
-            part.show()
+    with files.lock(args.results):
+        for part in [Part(f"people_{name}", args) for name in args.environments]:
+            if not args.rows_only:
+                part.run()
+            if part.rows():
+                part.show()
 
 
 if __name__ == "__main__":

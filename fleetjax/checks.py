@@ -59,6 +59,8 @@ def check_run(config: Config, env: Env | None = None, state: FleetState | None =
 
 def check_plan(config: Config, env: Env | None = None, state: FleetState | None = None, *, copies: int = 1) -> Env:
     """Check as `check_run`, but not the backend: another process, which may have a GPU, computes `copies` of it at once."""
+    check_kind("env", env, Env, "fleetjax.envs.make(name)")
+    check_kind("state", state, FleetState, "what prepare returns, or the state of a run's Result")
     validate(config, env)
     check_single(config)
     check_mesh(config)
@@ -166,6 +168,26 @@ def memory() -> int:
     return min([machine, *(int(limit) for limit in limits if limit.isdecimal())])
 
 
+def check_key(key: Any) -> None:
+    """Check that a key is one.
+
+    Raises:
+        ValueError: if it is not.
+    """
+    if not (isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and not key.ndim):
+        raise ValueError("key must be one key, jax.random.key(0); use jax.vmap or jax.lax.map over several")
+
+
+def check_kind(what: str, value: Any, kind: type, remedy: str) -> None:
+    """Check that an argument is what it should be, unless it is None.
+
+    Raises:
+        ValueError: if it is something else.
+    """
+    if value is not None and not isinstance(value, kind):
+        raise ValueError(f"{what} is a {type(value).__name__}, and must be a {kind.__name__}: {remedy}")
+
+
 def check_state(config: Config, env: Env, state: FleetState, shapes: FleetState) -> None:
     """Check that a run can start from a state.
 
@@ -203,7 +225,7 @@ def check_state(config: Config, env: Env, state: FleetState, shapes: FleetState)
 def _other_structure(config: Config, made_for: str) -> str:
     """Return the message for a state with another structure than a run needs."""
     if config.algorithm == made_for:
-        differ = "hidden_sizes, estimators, human_model, link_model"
+        differ = "allocation, hidden_sizes, estimators, human_model, link_model"
         return f"the state has another structure than this configuration needs ({differ}); {_REMEDY}"
     return (
         f"algorithm = {config.algorithm!r} keeps other estimators or another memory than {made_for!r}, for which the state was "
@@ -222,10 +244,8 @@ def _layout(state: FleetState) -> FleetState:
 
     data = state.human_data
     described = jax.tree.map(describe, state, is_leaf=is_buffer)
-    resample = _struct(data.resample, 1)
-    return described._replace(
-        human_data=described.human_data._replace(resample=resample), origin=FleetState._field_defaults["origin"]
-    )
+    rows = {"resample": _struct(data.resample, 1), "weight": None if data.weight is None else _struct(data.weight, 1)}
+    return described._replace(human_data=described.human_data._replace(**rows), origin=FleetState._field_defaults["origin"])
 
 
 def _struct(x: Any, first_axis: int = 0) -> jax.ShapeDtypeStruct:

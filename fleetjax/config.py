@@ -371,8 +371,10 @@ def _check_soft(config: Config, algorithm: priority.Algorithm, env: envs.Env) ->
     if env.spec.discrete or (env.success_margin is None and env.spec.success_return is None):
         raise ValueError(
             f"allocation = 'soft' cannot relax environment = {env.spec.name!r}, whose actions are discrete, or whose successes "
-            "have no Env.success_margin"
+            "have neither Env.success_margin nor EnvSpec.success_return"
         )
+    if config.augmented_copies > 1:
+        raise ValueError(f"augmented_copies = {config.augmented_copies} must be 1 for allocation = 'soft'")
     if not isinstance(config.temperature, Tracer) and np.any(np.asarray(config.temperature) <= 0):
         raise ValueError(f"temperature = {config.temperature} must be positive for allocation = 'soft'")
 

@@ -10,7 +10,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from fleetjax import envs, sharding
-from fleetjax.checks import check_run
+from fleetjax.checks import check_key, check_kind, check_run
 from fleetjax.config import Config
 from fleetjax.distribute import alone, place, spread
 from fleetjax.field import FIELDS, OF_HUMANS, OF_LINKS
@@ -59,6 +59,7 @@ def prepare(config: Config, key: jax.Array, env: envs.Env | None = None, mesh: M
 
 def _prepare(config: Config, key: jax.Array, env: envs.Env | None) -> FleetState:
     """Return the fleet at t = 0, before it is divided."""
+    check_key(key)
     env = check_run(config, env)
     key_policy, key_estimators, key_reset = jax.random.split(key_at(key, -1), 3)
     parts = make_parts(config, env)
@@ -175,6 +176,9 @@ def simulate(
     logged: bool,
 ) -> tuple[Result, Any]:
     """Return the Result of `run` and, if `logged`, the Interventions[T, M] of `run_logged`; else None."""
+    check_key(key)
+    if logged and config.allocation == "soft":
+        raise ValueError("allocation = 'soft' blends actions, so no human's action can be logged; use allocation = 'hard'")
     with sharding.over(mesh, config.num_humans):
         env = check_run(config, env, state)
         start = spread(_prepare(config, key, env) if state is None else state)
@@ -229,6 +233,8 @@ def evaluate(config: Config, key: jax.Array, policy: PolicyState, env: envs.Env 
 
     Reference: paper, Appendix (evaluating trained simulation policies).
     """
+    check_key(key)
+    check_kind("policy", policy, PolicyState, "the policy of a run's state, result.state.policy")
     members = jax.tree.leaves(policy.params)[0].shape[0]
     config = without_teleoperation(config).replace(ensemble_size=members)
     env = check_run(config, env)

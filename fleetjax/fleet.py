@@ -107,6 +107,8 @@ class Fleet(NamedTuple):
         advance: `(state, Plan, human_action f32[N, A], given bool[N], key) -> (state, Metrics)`. `given` marks robots whose
             supervisor really gave that action; on other robots the policy acts, and nothing is recorded.
         step: `(state, key) -> (state, Metrics)`, with the simulated supervisor.
+
+    With `allocation = "soft"` there is no `advance`, and `plan` takes all humans.
     """
 
     init: Callable[..., FleetState]
@@ -136,11 +138,15 @@ def make_fleet(config: Config, env: Env) -> Fleet:
     parts, n = make_parts(config, env), config.num_robots
 
     def plan_(state: FleetState, key: jax.Array, available: jax.Array | None = None) -> tuple[FleetState, Plan]:
+        if available is not None and config.allocation == "soft":
+            raise ValueError("allocation = 'soft' shares all humans; omit available, or use allocation = 'hard'")
         return plan(parts, state, split_keys(key, n), available)
 
     def advance(
         state: FleetState, plan: Plan, human_action: jax.Array, given: jax.Array, key: jax.Array
     ) -> tuple[FleetState, Metrics]:
+        if config.allocation == "soft":
+            raise ValueError("allocation = 'soft' takes a share of the human's action on every robot; use step, or 'hard'")
         return act(parts, state, plan, human_action, given, split_keys(key, n))[:2]
 
     def step(state: FleetState, key: jax.Array) -> tuple[FleetState, Metrics]:

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jax.interpreters import partial_eval
 
@@ -42,7 +43,8 @@ class Sensitivity(NamedTuple):
     Attributes:
         value: f32[] the objective.
         gradient: f32[] by field, its derivative.
-        standard_error: f32[] by field, of the gradient; NaN for one key, unless `"smoothed"` has more than two samples.
+        standard_error: f32[] by field, of the gradient; NaN for one key, unless `"smoothed"` has more than two samples of which
+            some differ.
     """
 
     value: jax.Array
@@ -81,7 +83,8 @@ def sensitivity(
             algorithms with differentiable scores such as `weighted`. `"forward"`: forward mode through the run as configured,
             one field after the other. For environments on MJX, too.
         width: of the noise in `"smoothed"`, its standard deviation: a fraction of each field's value (0.1 if None), or a
-            mapping from fields to widths themselves. Shifted values beyond a field's range count as its bound.
+            mapping from fields to widths themselves. Shifted values beyond a field's range count as its bound: at a bound the
+            derivative is that of the clipped objective, half of the one-sided slope.
         num_samples: shifted runs for each key in `"smoothed"`, an even number.
         env: the environment, if it is not the registered one that the configuration names.
 
@@ -155,8 +158,8 @@ def check_request(
     if method not in METHODS:
         raise ValueError(unknown("method", method, METHODS))
     _check_fields(config, names, method)
-    if num_samples < 2 or num_samples % 2:
-        raise ValueError(f"num_samples = {num_samples} must be even, and at least 2: runs come in pairs")
+    if not is_whole(num_samples) or num_samples < 2 or num_samples % 2:
+        raise ValueError(f"num_samples = {num_samples!r} must be an even number, and at least 2: runs come in pairs")
     if method == "relaxed":
         config = config.replace(allocation="soft")
     env = checks.check_run(config, env)
@@ -286,12 +289,27 @@ def _widths(config: Config, names: Sequence[str], width: float | Mapping[str, fl
     unknown_names = set(given) - set(names)
     if unknown_names:
         raise ValueError(f"width names {', '.join(sorted(unknown_names))}, which fields does not have")
+    if not all(map(_is_finite, given.values() if isinstance(width, Mapping) else [0 if width is None else width])):
+        raise ValueError(f"width = {width!r} must be a finite number, or a mapping from fields to such numbers")
     share = WIDTH if width is None or isinstance(width, Mapping) else width
     widths = {name: given[name] if name in given else share * abs(_concrete(config, name)) for name in names}
     for name, found in widths.items():
         if not isinstance(found, Tracer) and not found > 0:
             raise ValueError(f"width of {name} = {found} must be positive; pass width={{{name!r}: ...}}")
     return {name: jnp.float32(found) for name, found in widths.items()}
+
+
+def _is_finite(value: Any) -> bool:
+    """Return whether a value is a finite number, or may be one, since it is traced."""
+    try:
+        return isinstance(value, Tracer) or (not isinstance(value, str) and math.isfinite(value))
+    except TypeError:
+        return False
+
+
+def is_whole(value: Any) -> bool:
+    """Return whether a value is a whole number."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
 
 def _concrete(config: Config, name: str) -> float:

@@ -169,3 +169,12 @@ def test_playground(monkeypatch):
     assert states.success[:, -1].tolist() == [True, False]
     with pytest.raises(ValueError, match="playground environment = 'Side' is unknown; choose one of Slide"):
         envs.from_playground("Side", supervisor="balance")
+
+
+def test_an_environment_that_is_made_in_64_bits_computes_in_32():
+    with jax.enable_x64(True):
+        env = envs.from_brax("inverted_pendulum", supervisor="balance", horizon=HORIZON, success_return=HORIZON - 0.5)
+        config = fleetjax.make_config(env, "expert", num_robots=2, num_humans=2, num_steps=3)
+        result = jax.eval_shape(functools.partial(fleetjax.run, env=env), config, jax.random.key(0))
+    for leaf in jax.tree.leaves(result):
+        assert leaf.dtype.itemsize <= 4 or jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)

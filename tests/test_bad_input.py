@@ -7,8 +7,9 @@ import pytest
 from commands import contents, refused
 
 import fleetjax
-from fleetjax import checks, supervisors
+from fleetjax import checks, priority, supervisors
 from fleetjax.config import Config
+from fleetjax.field import Field
 from fleetjax.io import files
 
 RUN = ("run", "navigation")
@@ -141,3 +142,44 @@ def test_a_run_that_cannot_fit_the_memory_is_refused_with_both_numbers(monkeypat
 def test_a_disk_that_fails_costs_one_line(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(files.os, "fsync", lambda descriptor: (_ for _ in ()).throw(OSError(28, "No space left on device")))
     assert refused(capsys, *RUN, "--output", tmp_path / "run") == "fleetjax: No space left on device\n"
+
+
+def test_arguments_of_another_kind_are_refused():
+    config = fleetjax.make_config("navigation", num_robots=4, num_humans=2, num_steps=3)
+    key = jax.random.key(0)
+    calls = {
+        "key must be one key": (
+            lambda: fleetjax.run(config, jax.random.PRNGKey(0)),
+            lambda: fleetjax.run(config, 0),  # type: ignore[arg-type]
+            lambda: fleetjax.prepare(config, jax.random.split(key)),
+        ),
+        "state is a Config, and must be a FleetState: what prepare returns": (
+            lambda: fleetjax.run(config, key, config),  # type: ignore[arg-type]
+        ),
+        r"env is a str, and must be a Env: fleetjax.envs.make\(name\)": (
+            lambda: fleetjax.run(config, key, env="navigation"),  # type: ignore[arg-type]
+        ),
+        "policy is a Config, and must be a PolicyState": (lambda: fleetjax.evaluate(config, key, config),),  # type: ignore[arg-type]
+    }
+    for message, wrong in calls.items():
+        for call in wrong:
+            with pytest.raises(ValueError, match=message):
+                call()
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        (
+            "shadow",
+            {"parameters": {"temperature": Field("mine", default=2.0)}},
+            "'temperature' of 'shadow' is a field of Config",
+        ),
+        ("bare", {"parameters": {"mine": 2.0}}, "'mine' of 'bare' must be a fleetjax.field.Field"),
+        ("text", {"estimators": "safety"}, r"must be a tuple of names: \('safety',\)"),
+    ],
+)
+def test_rules_that_could_not_be_configured_are_not_registered(name, options, message):
+    with pytest.raises(ValueError, match=message):
+        fleetjax.register_priority(name, lambda config: priority.stateless(lambda signals, key: signals.risk), **options)
+    assert name not in priority.list_algorithms()

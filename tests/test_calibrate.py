@@ -63,8 +63,17 @@ def test_the_nearest_is_told_where_nothing_spends_so_much(tmp_path, capsys):
         (["--human-time", "100", "--field", "uncertainty"], "field = 'uncertainty' must be a real-valued traced field"),
         (["--human-time", "100", "--seeds", "0"], "seeds must name one or more"),
         (["--human-time", "100", "--most", "0"], "most = 0 must be at least 1"),
+        (["--human-time", "100", "--field", "takeover_time"], "takeover_time has no effect with human_model = 'perfect'"),
+        (["--human-time", "100", "--field", "success_return"], "field = 'success_return' may be negative"),
+        (["--human-time", "100", "--first-seed", str(2**32 - 1), "--seeds", "2"], f"end at seed {2**32}, beyond {2**32 - 1}"),
     ],
 )
 def test_what_cannot_be_found_is_refused(tmp_path, capsys, arguments, words):
     assert words in refused(capsys, "calibrate", *SMALL, "--output", tmp_path / "new", *arguments)
     assert not (tmp_path / "new").exists()
+
+
+def test_runs_of_other_settings_in_the_same_folder_are_refused_in_a_line(solved, capsys):
+    given = ("--human-time", 120, "--seeds", 3, "--tolerance", 0.1, "--hard-reset-time", 3)
+    reason = refused(capsys, "calibrate", *SMALL, "--output", solved, *given)
+    assert "hard_reset_time = 3, but the run has 5" in reason

@@ -294,6 +294,29 @@ def test_rows_hold_whole_runs(study, tmp_path):
     assert fleetjax.compare(found[:10]).csv() == fleetjax.compare(study).csv()
 
 
+@pytest.mark.parametrize(
+    ("algorithm", "given"),
+    [
+        ("constraint_trained", {"gradient_steps": 2, "pretraining_steps": 1160, "num_steps": 40}),
+        ("cur", {"human_model": "perfect", "absence_time": 50.0, "takeover_spread": 0.2}),
+        ("cur", {"human_model": "imperfect"}),
+        ("cur", {"num_humans": 2, "takeover_time": (1.0, 2.5), "link_model": "swapping"}),
+        ("random", {"link_model": "gilbert_elliott", "link_failure_rate": 0.3, "random_threshold": 0.25}),
+    ],
+)
+def test_rows_give_back_the_configuration_though_defaults_follow_from_others(tmp_path, algorithm, given):
+    config = fleetjax.make_config("navigation", algorithm, **given)
+    path = tmp_path / "rows.csv"
+    path.write_bytes(rows.write(sources.collect([(config, 0, make_metrics(0, config.num_steps))])))
+    assert plain.to_plain(rows.read(path)[0].config) == plain.to_plain(config)
+
+
+def test_a_file_that_is_named_twice_is_refused(study, tmp_path, capsys):
+    path = tmp_path / "table.csv"
+    assert "is named twice" in refused(capsys, "compare", study, "--output", path, "--rows", path)
+    assert not path.exists()
+
+
 def test_figures_of_rows_are_those_of_the_runs(study, tmp_path):
     (tmp_path / "rows.csv").write_bytes(rows.write(sources.collect(study)))
     drawn, again = (fleetjax.plot(source).axes for source in (study, tmp_path / "rows.csv"))

@@ -10,13 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from commands import refused as command_refused
 from compiling import compiled
 from hypothesis import given
 from hypothesis import strategies as st
 
 import fleetjax
-from fleetjax import checks, gradients
-from fleetjax.config import get_value
+from fleetjax import checks, gradients, soft
+from fleetjax.config import _check_soft, get_value
 from fleetjax.experiment import scan_in_blocks
 from fleetjax.field import ORDERS
 from fleetjax.priority import get_algorithm
@@ -208,7 +209,80 @@ def test_the_soft_fleet_is_the_hard_one_at_temperature_0():
     assert other.human_steps.dtype == jnp.float32
 
 
+def test_the_metrics_of_a_soft_fleet_are_sums_of_shares_and_of_soft_successes(config):
+    config, margin = config.replace(allocation="soft", temperature=0.5), np.array([0.4, -0.3, 2.0, 1.0, -4.0])
+    env = fleetjax.envs.make("navigation")._replace(success_margin=lambda state: state.physics)
+    violation, moving = np.array([False, False, True, False, False]), np.array([True, True, True, False, True])
+    begun = jax.vmap(lambda x: fleetjax.envs.begin(physics=x, obs=x[None]))(jnp.asarray(margin, jnp.float32))
+    stepped = begun._replace(violation=jnp.asarray(violation))
+    weight = np.array([0.1, 0.2, 0.3, 0.4, 0.5])
+    nothing = fleetjax.Metrics(*[jnp.zeros(())] * len(fleetjax.Metrics._fields))
+    found = soft.relax(config, env, nothing, jnp.asarray(weight), stepped, jnp.asarray(moving))
+    expected = 1 / (1 + np.exp(-margin / 0.5))
+    np.testing.assert_allclose(found.successes, expected[moving & ~violation].sum(), rtol=1e-5)
+    np.testing.assert_allclose(found.human_steps, 1.5, rtol=1e-6)
+    np.testing.assert_allclose(found.teleop_steps, 1.1, rtol=1e-6)
+
+
+def test_a_robot_keeps_the_share_that_it_had_while_its_human_is_bound_to_it(config):
+    humans = fleetjax.HumanState(jnp.array([2, 4], jnp.int32), jnp.array([1, 9], jnp.int32))
+    weight, score = jnp.array([0.0, 0.0, 0.3, 0.0, 0.6]), jnp.array([5.0, 0.0, 1.0, 0.2, 0.0])
+    found = soft.share(config.replace(allocation="soft"), humans, weight, score, jnp.full(5, 3))
+    assert float(found[2]) == pytest.approx(0.3)
+    np.testing.assert_allclose(found, jnp.where(jnp.arange(5) == 2, 0.3, soft_top_k(score.at[2].set(0), 1, 0.1)), atol=1e-6)
+
+
+def test_pairs_of_a_soft_fleet_count_by_its_shares_and_it_continues_from_its_states(config):
+    config = config.replace(allocation="soft", temperature=20.0, uncertainty_threshold=0.01)
+    fleet, state = fleetjax.make_fleet(config, fleetjax.envs.make("navigation")), compiled(fleetjax.prepare)(config, KEYS[0])
+    step, number = compiled(fleet.step), 0
+    for t in range(3):
+        before = state
+        state, _ = step(before, jax.random.key(t))
+        first, last = int(before.human_data.pairs.added), int(state.human_data.pairs.added)
+        shares = np.asarray(state.weight)[np.asarray(state.given)]
+        np.testing.assert_array_equal(state.human_data.weight[first:last], shares)
+        number += np.sum((shares > 0.01) & (shares < 0.99))
+    assert number > 0
+    longer = fleetjax.extend(state, 20)
+    whole = compiled(fleetjax.run)(config.replace(num_steps=3), KEYS[0], state)
+    more = compiled(fleetjax.run)(config.replace(num_steps=3), KEYS[0], longer)
+    jax.tree.map(np.testing.assert_array_equal, whole.metrics, more.metrics)
+    assert int(whole.metrics.dropped.sum()) == 0
+
+
+def test_what_a_soft_fleet_cannot_do_is_refused(config, capsys):
+    config = config.replace(allocation="soft")
+    with pytest.raises(ValueError, match="no human's action can be logged"):
+        fleetjax.run_logged(config, KEYS[0])
+    fleet = fleetjax.make_fleet(config, fleetjax.envs.make("navigation"))
+    with pytest.raises(ValueError, match="omit available"):
+        jax.eval_shape(fleet.plan, checks.state_shapes(config, fleetjax.envs.make("navigation")), KEYS[0], jnp.ones(2, bool))
+    with pytest.raises(ValueError, match="use step"):
+        fleet.advance(None, None, None, None, KEYS[0])  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="augmented_copies = 4 must be 1"):  # asked of environments with images
+        _check_soft(config.replace(augmented_copies=4), get_algorithm("weighted"), fleetjax.envs.make("navigation"))
+    for command in ("run", "sweep"):
+        given = ("navigation", "--algorithm", "weighted", "--allocation", "soft", "--output", "nowhere")
+        assert "allocation = 'soft' is for derivatives in Python" in command_refused(capsys, command, *given)
+
+
 # --- gradients ---
+
+
+@pytest.mark.slow
+def test_runs_of_a_pair_have_the_same_randomness_and_each_step_of_tuning_its_own(config):
+    """The objective depends on the runs alone, and `temperature` has no effect on a hard fleet."""
+
+    def worth(metrics, config):
+        return jnp.sum(metrics.reward)
+
+    with pytest.warns(UserWarning, match="does not depend on temperature"):
+        found = fleetjax.sensitivity(config, KEYS, "temperature", objective=worth, num_samples=8)
+    assert float(found.gradient["temperature"]) == 0
+    with pytest.warns(UserWarning, match="does not depend on temperature"):
+        tuned = fleetjax.tune(config, KEYS, "temperature", steps=3, objective=worth, num_samples=2)
+    assert len(np.unique(tuned.objective)) == 3
 
 
 def human_time(metrics, config):
@@ -374,7 +448,18 @@ def test_bad_requests_are_refused_before_anything_is_computed(config, monkeypatc
     assert "each once" in refused(config, fields=())
     assert "each once" in refused(config, fields=("risk_threshold", "risk_threshold"))
     assert "random_threshold is a parameter of algorithm = 'random'" in refused(config, fields="random_threshold")
-    assert "num_samples = 3" in refused(config, num_samples=3)
+    for number in (3, 2.0, "4", True):
+        assert f"num_samples = {number!r} must be an even number" in refused(config, num_samples=number)
+    for width in ("wide", "0.1", {"risk_threshold": None}, math.inf, math.nan):
+        assert "must be a finite number" in refused(config, width=width)
+    for options, message in (
+        ({"steps": 2.5}, "steps = 2.5 must be a whole number"),
+        ({"steps": True}, "steps = True must be a whole number"),
+        ({"learning_rate": -1.0}, "learning_rate = -1.0 must be a finite number above 0"),
+        ({"learning_rate": math.nan}, "learning_rate = nan must be a finite number above 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            fleetjax.tune(config, KEYS, "risk_threshold", **options)
     assert "method = 'reverse'" in refused(config, method="reverse")
     assert "keys must be" in refused(config, keys=jnp.zeros(2, jnp.uint32))
     assert "width of goal_weight = 0.0" in refused(config, fields="goal_weight")

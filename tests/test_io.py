@@ -257,6 +257,10 @@ def test_only_a_run_is_overwritten(saved, tmp_path):
         folder.check_folder(saved, overwrite=False)
     (saved / "config.json").write_text("{")
     folder.check_folder(saved, overwrite=True)
+    (saved / "lerobot").mkdir()
+    with pytest.raises(FileExistsError, match="holds lerobot, exported from its run; move or delete it"):
+        folder.check_folder(saved, overwrite=True)
+    (saved / "lerobot").rmdir()
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty" / files.LOCK).touch()  # as a kill may leave them
     (tmp_path / "empty" / ".config.json.partial").touch()

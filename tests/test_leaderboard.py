@@ -46,6 +46,23 @@ def test_the_table_has_the_most_successes_first_and_stars_for_other_human_times(
     assert (stored / "leaderboard.png").stat().st_size > 10_000
 
 
+def test_extra_demonstrations_count_as_human_time_and_the_newest_settings_stand(stored):
+    store, runs = leaderboard.Store(stored), []
+    place = leaderboard.Place("navigation", "constraint", 5000, "", 0.0, 0.0, solved=False)
+    config = fleetjax.make_config("navigation", "constraint", initial_period=0, num_steps=40, extra_demonstrations=2000)
+    for seed in range(3):
+        metrics = make_metrics(seed, 40)
+        runs.append((config, seed, metrics._replace(human_steps=np.full(40, 150, np.int32))))
+    store.add(place, sources.collect(runs))
+    assert cli.main(["leaderboard", "show", "--results", str(stored)]) == 0
+    line = next(line for line in (stored / "leaderboard.md").read_text().splitlines() if "| Constraint" in line)
+    cells = [cell.strip() for cell in line.split("|")]
+    assert cells[4] == "8,000"  # 40 * 150 + 2,000, of which the older runs have 6,000
+    successes = [int(metrics.successes.sum()) for _, _, metrics in runs]
+    rohe = np.mean([config.num_humans / config.num_robots * count / (1 + 8000 / 100) for count in successes])
+    assert float(cells[6]) == pytest.approx(rohe, rel=0.01)
+
+
 def test_stored_runs_and_calibrations_are_read_again(stored):
     again = leaderboard.Store(stored)
     assert [place.algorithm for place in again.places] == ["cur", "random", "constraint"]
@@ -63,7 +80,7 @@ def test_stored_runs_and_calibrations_are_read_again(stored):
         ((), "the following arguments are required: ACTION"),
         (("add", "curr"), "algorithm = 'curr' is unknown; the closest are"),
         (("add", "cur", "--environments", "mars"), "environment = 'mars' has no leaderboard; choose from navigation"),
-        (("add", "cur", "--seeds", "0"), "seeds = 0 must be at least 1"),
+        (("add", "cur", "--seeds", "0"), "seeds = 0 must be from 1 to 100"),
         (("add", "cur", "--budgets", "0"), "human_time = 0 must lie between 0 and 20000"),
         (("add", "thrifty_dagger", "--environments", "humanoid"), "needs a goal"),
     ],
@@ -72,6 +89,21 @@ def test_what_cannot_be_compared_is_refused(arguments, reason, stored, capsys):
     before = {path.name: path.read_bytes() for path in stored.iterdir()}
     assert reason in refused(capsys, "leaderboard", *arguments, *(["--results", stored] if arguments else []))
     assert {path.name: path.read_bytes() for path in stored.iterdir()} == before
+
+
+def test_rows_without_their_calibrations_are_refused_and_nothing_is_overwritten(stored, capsys):
+    shown = (stored / "leaderboard.md").read_bytes() if (stored / "leaderboard.md").exists() else None
+    for content, reason in (
+        (None, "has no calibrations of theirs"),
+        ("{}", "leaderboard.json cannot be used: 'calibrations'"),
+        ('{"calibrations": [{"rule": 1}]}', "leaderboard.json cannot be used"),
+        ("{", "leaderboard.json cannot be used"),
+    ):
+        (stored / "leaderboard.json").unlink(missing_ok=True)
+        if content:
+            (stored / "leaderboard.json").write_text(content)
+        assert reason in refused(capsys, "leaderboard", "show", "--results", stored)
+        assert ((stored / "leaderboard.md").read_bytes() if (stored / "leaderboard.md").exists() else None) == shown
 
 
 def test_robots_keep_the_initial_period_and_have_one_threshold_tuned(tmp_path):

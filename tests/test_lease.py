@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import signal
 import threading
 import time
 
@@ -11,7 +12,7 @@ from fleetjax.io import files
 from fleetjax.io.lease import LOST, Leases
 
 RUN = "navigation-cur-seed0"
-LONG, SOME, SHORT = 1000.0, 3.0, 0.5  # seconds; SOME is renewed in time even on a busy machine
+LONG, SOME, OWNERS, SHORT = 1000.0, 6.0, 2.0, 0.5  # seconds; SOME is renewed in time even on a busy machine
 
 
 def test_a_run_has_one_owner_and_is_free_when_it_is_done_with_it(tmp_path):
@@ -64,24 +65,47 @@ def test_an_owner_that_renews_keeps_its_run_for_longer_than_a_term(tmp_path, mon
     assert other.is_free(other.look(RUN))
 
 
-def own(folder, term, begun, proceed):
-    leases = Leases(folder, "sweep", term)
+def own(folder, begun, hangs):
+    """Take the run in another process; if `hangs`, writing to the disk never comes back."""
+    leases = Leases(folder, "sweep", OWNERS)
     assert leases.is_free(leases.look(RUN))
+    files.os.fsync = lambda _: None
     with leases.taken(RUN):
+        if hangs:
+            files.os.fsync = lambda _: time.sleep(LONG)
         begun.set()
-        proceed.wait()
+        time.sleep(LONG)
+
+
+def test_an_owner_whose_disk_hangs_ends_within_its_term(tmp_path):
+    context = multiprocessing.get_context("spawn")
+    begun = context.Event()
+    process = context.Process(target=own, args=(tmp_path, begun, True))
+    process.start()
+    begun.wait()
+    process.join()
+    assert process.exitcode == LOST
+    assert not (tmp_path / RUN / "1").exists()
+
+
+def test_a_worker_with_a_shorter_term_waits_for_the_owners(tmp_path):
+    owner, other = Leases(tmp_path, "sweep", LONG), Leases(tmp_path, "sweep", 1e-3)
+    assert owner.is_free(owner.look(RUN))
+    with owner.taken(RUN):
+        assert not other.is_free(other.look(RUN))
+        time.sleep(0.1)
+        assert not other.is_free(other.look(RUN))
 
 
 @pytest.mark.parametrize("alive", [False, True])
 def test_a_dead_owner_loses_its_run_and_one_taken_for_dead_ends(tmp_path, alive):
     context = multiprocessing.get_context("spawn")
-    begun, proceed = context.Event(), context.Event()
-    process = context.Process(target=own, args=(tmp_path, LONG, begun, proceed))  # it renews once in minutes
+    begun = context.Event()
+    process = context.Process(target=own, args=(tmp_path, begun, False))
     process.start()
     begun.wait()
-    if not alive:
-        process.kill()
-        process.join()
+    assert process.pid
+    os.kill(process.pid, signal.SIGSTOP if alive else signal.SIGKILL)
     leases = Leases(tmp_path, "sweep", SHORT)
     assert not leases.is_free(leases.look(RUN))
     while not leases.is_free(leases.look(RUN)):
@@ -89,7 +113,7 @@ def test_a_dead_owner_loses_its_run_and_one_taken_for_dead_ends(tmp_path, alive)
     with leases.taken(RUN) as held:
         assert held
         if alive:
-            proceed.set()
+            os.kill(process.pid, signal.SIGCONT)
             process.join()
             assert process.exitcode == LOST
     assert sorted(os.listdir(tmp_path / RUN)) == ["0", "1"]

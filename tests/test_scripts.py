@@ -1,5 +1,6 @@
 """Every script in benchmarks/ and experiments/ prints and writes what it should, with arguments that make it small."""
 
+import argparse
 import os
 import re
 import shlex
@@ -14,7 +15,7 @@ import pytest
 from commands import TINY, make_metrics, write_run
 
 import fleetjax
-from fleetjax.io import rows, sources
+from fleetjax.io import rows, scripts, sources
 
 ROOT = Path(__file__).parents[1]
 SCRIPTS = sorted(
@@ -55,6 +56,16 @@ def make_runs(place: Path) -> None:
     config = fleetjax.make_config("navigation", num_robots=6, num_humans=2, num_steps=40)
     for seed in range(2):
         write_run(place / f"run-{seed}", config, seed, make_metrics(seed, 40))
+
+
+def test_parameters_of_rules_are_passed_on_and_other_flags_refused(monkeypatch, capsys):
+    parser = argparse.ArgumentParser(prog="script")
+    monkeypatch.setattr("sys.argv", ["script", "--", "--num-robots", "6", "--teaching-time", "4", "--takeover-time", "2"])
+    assert scripts.parse(parser)[1] == {"num_robots": 6, "teaching_time": 4.0, "takeover_time": 2.0}
+    monkeypatch.setattr("sys.argv", ["script", "--", "--num-robots", "6", "--seed", "7", "--output", "here"])
+    with pytest.raises(SystemExit):
+        scripts.parse(parser)
+    assert "only parameters of a run may follow after --, and not --seed, --output" in capsys.readouterr().err
 
 
 def make_rows(place: Path) -> None:

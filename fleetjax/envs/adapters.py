@@ -12,9 +12,11 @@ import jax
 import jax.numpy as jnp
 
 from fleetjax.envs import base
+from fleetjax.precision import in_32_bits
 from fleetjax.types import EnvState
 
 
+@in_32_bits
 def from_brax(
     name: str, *, supervisor: str, horizon: int = 1000, success_return: float | None = None, **kwargs: Any
 ) -> base.Env:
@@ -40,6 +42,7 @@ def from_brax(
     return _adapt(raw, f"brax/{name}", supervisor=supervisor, horizon=horizon, success_return=success_return)
 
 
+@in_32_bits
 def from_playground(
     name: str, *, supervisor: str, horizon: int = 1000, success_return: float | None = None, **overrides: Any
 ) -> base.Env:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleetjax.config import Config, all_fields, check_one_for_all, get_value
+from fleetjax.config import Config, all_fields, check_one_for_all, get_value, validate
 from fleetjax.io import files, folder, resumable, text
 from fleetjax.io.progress import say
 from fleetjax.search import Scale, solve
@@ -81,7 +81,13 @@ def check(request: Request) -> None:
     if field is None or not field.traced or field.kind is not float:
         real = ", ".join(name for name, other in known.items() if other.traced and other.kind is float)
         raise ValueError(f"field = {request.field!r} must be a real-valued traced field; choose one of {real}")
+    if field.low is None or field.low < 0:
+        raise ValueError(
+            f"field = {request.field!r} may be negative, and only values of at least 0 are searched; choose another"
+        )
     check_one_for_all(request.config, request.field)
+    usual = max(field.low, min(field.high or 1.0, 1.0) / 2)
+    validate(request.config.replace(**{request.field: usual}))  # such as that it has an effect
     largest = request.config.num_humans * request.config.num_steps
     if not 0 < request.human_time < largest:
         raise ValueError(

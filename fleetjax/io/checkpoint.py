@@ -197,6 +197,14 @@ def is_any_finished(folder: Path) -> bool:
     return any((path / MANIFEST).exists() for path in _found(folder / FOLDER))
 
 
+def parts(folder: Path) -> int:
+    """Return over how many devices the fleet of the newest finished checkpoint was divided; 1 if that is not known."""
+    for path in reversed(_found(folder / FOLDER)):
+        with contextlib.suppress(OSError, ValueError, AttributeError, TypeError):
+            return int(json.loads((path / MANIFEST).read_text()).get("parts", 1))
+    return 1
+
+
 def _found(folder: Path) -> list[Path]:
     """Return the checkpoints in a folder, finished or not, oldest first; foreign files are ignored."""
     return sorted(path for path in folder.glob("[0-9]" * 10) if path.is_dir() and not path.is_symlink())

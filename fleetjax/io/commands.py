@@ -56,6 +56,9 @@ def run_fleet(arguments: argparse.Namespace) -> None:
     if arguments.distributed:
         _run_together(arguments, given)
         return
+    for name in ("coordinator", "num_processes", "process_id"):
+        if getattr(arguments, name) is not None:
+            raise Refusal(f"--{name.replace('_', '-')} has no effect without --distributed; add it, or omit this")
     with _refusing():
         resumable.check_interval(arguments.checkpoint_every)
         run = _run_to_resume(arguments, given) if arguments.resume else _new_run(arguments, given)
@@ -65,6 +68,7 @@ def run_fleet(arguments: argparse.Namespace) -> None:
     with files.lock(run.folder):
         begun = time.monotonic()
         with _refusing():
+            run = folder.read_run(run.folder) if arguments.resume else run  # another process may have changed it meanwhile
             metrics = folder.read_finished(run) if arguments.resume else None
         if metrics:
             say(f"{run.folder} is already finished; there is nothing to resume")
@@ -128,6 +132,7 @@ def _config(arguments: argparse.Namespace, given: Mapping[str, Any]) -> Config:
     if arguments.command == "console":
         overrides = {**IN_CONSOLE, **overrides}
     config = make_config(given["environment"], given.get("algorithm", "cur"), **overrides)
+    folder.check_config(config)
     check_run(config)
     return config
 
@@ -189,7 +194,12 @@ def calibrate_field(arguments: argparse.Namespace) -> None:
             arguments.checkpoint_every,
         )
         calibration.check(request)
-    found = calibration.calibrate(request)
+        if request.seeds and request.seeds[-1] > parameters.LARGEST_SEED:
+            raise ValueError(
+                f"--first-seed {arguments.first_seed} and --seeds {arguments.seeds} end at seed {request.seeds[-1]}, "
+                f"beyond {parameters.LARGEST_SEED}; lower one"
+            )
+        found = calibration.calibrate(request)
     print(calibration.report(request, found))
 
 
@@ -248,6 +258,8 @@ def compare_runs(arguments: argparse.Namespace) -> None:
             files.check_ending(arguments.rows, (rows.SUFFIX,), flag="--rows")
         found = sources.collect(arguments.runs)
     outputs = [*arguments.output, *([arguments.rows] if arguments.rows else [])]
+    if repeated := [path for i, path in enumerate(outputs) if path.resolve() in [other.resolve() for other in outputs[:i]]]:
+        raise Refusal(f"{repeated[0]} is named twice; choose another path for one of the two")
     targets = [files.check_free(path, overwrite=arguments.overwrite) for path in outputs]
     with _refusing():
         metrics, different = arguments.metric or comparing.METRICS, arguments.allow_different
@@ -398,7 +410,9 @@ def lead(arguments: argparse.Namespace) -> None:
     from fleetjax.io import leaderboard, standings
 
     with _refusing():
-        if not leaderboard.Store(arguments.results).runs:
+        if not leaderboard.Store(arguments.results).rows.parent.is_dir() or (
+            arguments.action != "add" and not leaderboard.Store(arguments.results).runs
+        ):
             raise ValueError(
                 f"there are no stored runs in {arguments.results}; run this in a clone of the repository, or give --results DIR"
             )
@@ -413,7 +427,8 @@ def lead(arguments: argparse.Namespace) -> None:
                 say("their run folders remain: before you add a changed rule, delete them or choose another --output")
             for entry in entries:
                 leaderboard.compete(store, entry)
-            print(standings.publish(store))
+            page = standings.publish(store)
+            print(page if store.runs else "no runs are stored any more")
 
 
 COMMANDS: Mapping[str, Callable[[argparse.Namespace], None]] = {

@@ -124,7 +124,9 @@ def lock(folder: Path) -> Iterator[None]:
         try:
             yield
         finally:
-            path.unlink(missing_ok=True)
+            with contextlib.suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(file.fileno()), path.stat()):  # and not one that another process has made since
+                    path.unlink()
 
 
 class Log:

@@ -32,6 +32,7 @@ from fleetjax.version import VERSION
 CONFIG, FIGURE, POLICY, EVALUATION = "config.json", "figure.png", "policy.msgpack", "evaluation.json"
 METRICS = metrics_csv.FILE
 RECORD = "console.bin"  # what people did, where they supervised the run
+EXPORTS = ("lerobot", "minari", "robomimic.hdf5")  # where `fleetjax export` puts data sets unless told otherwise
 DATA = (METRICS, POLICY, interventions.FILE, RECORD)
 _OWN_DIGEST = "sha256_config"
 
@@ -64,6 +65,16 @@ def default_folder(config: Config, seed: int) -> Path:
     return next(p for p in itertools.chain([path], others) if not p.exists())
 
 
+def check_config(config: Config) -> None:
+    """Check that a run folder can hold the metrics of such a run.
+
+    Raises:
+        ValueError: if they are not counts.
+    """
+    if config.allocation == "soft":
+        raise ValueError("allocation = 'soft' is for derivatives in Python, and has no run folders; use allocation = 'hard'")
+
+
 def is_run(path: Path) -> bool:
     """Return whether a folder holds a run, even a damaged one."""
     return (path / CONFIG).exists()
@@ -81,6 +92,9 @@ def check_folder(path: Path, *, overwrite: bool) -> None:
         raise FileExistsError(f"{path} already exists and is not a run folder; choose another --output")
     if not overwrite:
         raise FileExistsError(f"{path} already exists; choose another --output, or pass --overwrite")
+    for name in EXPORTS:
+        if (path / name).exists():
+            raise FileExistsError(f"{path} holds {name}, exported from its run; move or delete it, or choose another --output")
 
 
 def prepare(run: Run) -> bool:

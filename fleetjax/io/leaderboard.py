@@ -18,7 +18,7 @@ import numpy as np
 
 from fleetjax.checks import check_run
 from fleetjax.config import Config, get_value, make_config
-from fleetjax.io import calibration, files, folder, resumable, rows
+from fleetjax.io import calibration, files, folder, resumable, rows, text
 from fleetjax.io.outcomes import Group, Outcome, group
 from fleetjax.io.progress import say
 from fleetjax.io.sources import collect
@@ -135,12 +135,18 @@ class Store:
 
     Args:
         results: their folder.
+
+    Raises:
+        ValueError: if one of the files is damaged.
     """
 
     def __init__(self, results: Path):
         self.table, self.rows = results / "leaderboard.json", results / "leaderboard.csv"
-        known = json.loads(self.table.read_text())["calibrations"] if self.table.exists() else []
-        self.places = [Place(**one) for one in known]
+        try:
+            known = json.loads(self.table.read_text())["calibrations"] if self.table.exists() else []
+            self.places = [Place(**one) for one in known]
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{self.table} cannot be used: {files.one_line(error)}; restore it") from None
         self.runs: list[Outcome] = rows.read(self.rows) if self.rows.exists() else []
 
     def find(self, environment: str, algorithm: str, budget: int) -> Place | None:
@@ -204,8 +210,9 @@ def entries(
     for environment in environments:
         if environment not in BUDGETS:
             raise ValueError(f"environment = {environment!r} has no leaderboard; choose from {', '.join(BUDGETS)}")
-    if seeds < 1:
-        raise ValueError(f"seeds = {seeds} must be at least 1")
+    most = min(Effort().seeds)
+    if not 1 <= seeds <= most:
+        raise ValueError(f"seeds = {seeds} must be from 1 to {most}; the calibrations use seed {most} and those after it")
     found, obstacles = [], []
     for algorithm in algorithms:
         get_algorithm(algorithm)
@@ -242,6 +249,9 @@ def compete(store: Store, entry: Entry) -> None:
     name = "-".join(f"{field}-{np.float32(value)!s}" for field, value in place.settings.items()) or "as-it-is"
     config = entry.config.replace(**place.settings)
     known = {folder.name_of(run) for run in store.runs}
+    stored = sum(folder.name_of(folder.Run(Path(), config, seed)) in known for seed in range(entry.seeds))
+    if stored:
+        say(f"{text.label(entry.algorithm)} has {text.plural(stored, 'stored run')} on {entry.environment} at {entry.budget:,}")
     for seed in range(entry.seeds):
         run = folder.Run(entry.folder / f"{name}-seed{seed}", config, seed)
         if folder.name_of(run) not in known:

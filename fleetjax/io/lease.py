@@ -2,8 +2,9 @@
 
 A run has a folder of leases: files 0, 1, 2 ..., of which the highest counts. A worker takes the run by making the next file,
 with a hard link, which succeeds for one worker alone. The owner renews its lease: several times in each `term` it raises a
-counter in the file. A worker that sees the same counter for a whole term takes the owner for dead, and makes the next file. An
-owner that finds a higher file, or could not write for most of a term, has lost the run: it ends its process at once.
+counter in the file. A worker that sees the same counter for a whole term (its own or the owner's, the longer one) takes the
+owner for dead, and makes the next file. An owner that finds a higher file, or could not write for most of its term, has lost
+the run: it ends its process at once.
 
 Assumed of the file system: of several machines that make the same hard link one succeeds, and a machine that opens a file sees
 what another wrote at least half a term ago. Locks may fail to keep other machines out. Clocks need not agree.
@@ -34,12 +35,14 @@ class Lease(NamedTuple):
         renewals: how often it was renewed.
         end: "" while the owner is at work; then "finished", "stopped" or "failed".
         reason: why it failed.
+        term: the owner's, in seconds.
     """
 
     owner: tuple[str, int, str]
     renewals: int
     end: str = ""
     reason: str = ""
+    term: float = 0.0
 
 
 class Seen(NamedTuple):
@@ -62,7 +65,7 @@ class Leases:
     Args:
         folder: that all workers share.
         sweep: name of the sweep that was started; runs that failed in an older one may be taken again.
-        term: seconds without renewal after which an owner is taken for dead; all workers must have the same.
+        term: seconds without renewal after which others may take this worker for dead.
     """
 
     def __init__(self, folder: Path, sweep: str, term: float):
@@ -85,13 +88,14 @@ class Leases:
 
     def is_free(self, seen: Seen) -> bool:
         """Return whether a run that has not ended may be taken: its owner is done with it, or has not renewed it for a term."""
-        return seen.number < 0 or bool(seen.lease and seen.lease.end) or time.monotonic() - seen.since >= self._term
+        term = max(self._term, seen.lease.term if seen.lease else 0.0)
+        return seen.number < 0 or bool(seen.lease and seen.lease.end) or time.monotonic() - seen.since >= term
 
     @contextlib.contextmanager
     def taken(self, run: str) -> Iterator["Held | None"]:
         """Take a run that was free when last looked at, and keep it until the block ends; None if another worker was faster."""
         path = self._folder / run / str(self._seen[run].number + 1)
-        held = Held(path, Lease(self._me, 0), self._term)
+        held = Held(path, Lease(self._me, 0, term=self._term))
         if not held.take():
             yield None
             return
@@ -102,18 +106,19 @@ class Leases:
 
 
 class Held:
-    """A lease that this process has, renewed by a thread.
+    """A lease that this process has, renewed by one thread. Another ends the process if that hangs, as a write to NFS can.
 
     Args:
         path: its file.
         lease: what it says at first.
-        term: see `Leases`.
     """
 
-    def __init__(self, path: Path, lease: Lease, term: float):
-        self._path, self._lease, self._term = path, lease, term
+    def __init__(self, path: Path, lease: Lease):
+        self._path, self._lease, self._term = path, lease, lease.term
         self._end = ("stopped", "")
+        self._renewed = time.monotonic()  # when the last write that succeeded began
         self._done, self._thread = threading.Event(), threading.Thread(target=self._renew, daemon=True)
+        self._released, self._watch = threading.Event(), threading.Thread(target=self._end_if_late, daemon=True)
 
     def take(self) -> bool:
         """Make the file; return False if another worker has made it."""
@@ -127,6 +132,7 @@ class Held:
         finally:
             own.unlink(missing_ok=True)
         self._thread.start()
+        self._watch.start()
         return True
 
     def end(self, how: str, reason: str = "") -> None:
@@ -137,15 +143,22 @@ class Held:
         """Renew it no longer, and let others know. An owner that was taken for dead ends its process here."""
         self._done.set()
         self._thread.join()
-        self._write(*self._end)
+        try:
+            self._write(*self._end)
+        finally:
+            self._released.set()
+            self._watch.join()
 
     def _renew(self) -> None:
-        last = time.monotonic()
         while not self._done.wait(self._term / RENEWALS):
+            begun = time.monotonic()
             with contextlib.suppress(OSError):
                 self._write()
-                last = time.monotonic()
-            if time.monotonic() - last > self._term * (1 - 1 / RENEWALS):
+                self._renewed = begun
+
+    def _end_if_late(self) -> None:
+        while not self._released.wait(self._term / (2 * RENEWALS)):
+            if time.monotonic() - self._renewed > self._term * (1 - 1 / RENEWALS):
                 os._exit(LOST)
 
     def _write(self, end: str = "", reason: str = "") -> None:
@@ -165,7 +178,11 @@ def _read(path: Path) -> Lease | None:
         content = json.loads(path.read_text())
         host, process, sweep = content["owner"]
         return Lease(
-            (str(host), int(process), str(sweep)), int(content["renewals"]), str(content["end"]), str(content["reason"])
+            (str(host), int(process), str(sweep)),
+            int(content["renewals"]),
+            str(content["end"]),
+            str(content["reason"]),
+            float(content.get("term", 0.0)),
         )
     except (OSError, ValueError, KeyError, TypeError):
         return None

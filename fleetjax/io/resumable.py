@@ -160,7 +160,7 @@ def _resume(run: folder.Run) -> Start | None:
     """Read the newest intact checkpoint, and say which are not; None if none was written yet.
 
     Raises:
-        Refusal: if there are checkpoints and none can be used.
+        Refusal: if there are checkpoints and none can be used, or they are those of a fleet that was divided over devices.
     """
 
     def check(found: checkpoint.Checkpoint) -> None:
@@ -168,6 +168,9 @@ def _resume(run: folder.Run) -> Start | None:
         if run.logged:
             files.beginning(run.folder / interventions.FILE, found.notes.get("interventions"))
 
+    parts = checkpoint.parts(run.folder)
+    if parts > 1:
+        raise Refusal(f"{run.folder} was run with --distributed on {parts} devices; repeat that command to resume it")
     shapes = state_shapes(run.config, envs.make(run.config.environment, run.config.backend))
     found, refused = checkpoint.restore(run.folder, folder.identity(run.config, run.seed), shapes, check)
     for reason in refused:

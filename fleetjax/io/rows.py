@@ -63,10 +63,16 @@ def _compact(content: Mapping[str, Any]) -> str:
 
 
 def _differing(config: Config, fields: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
-    """Return those `fields` of a configuration that differ from the defaults of a run's environment and algorithm."""
-    default = to_plain(make_config(**own))
+    """Return those `fields` of a configuration that differ from the defaults of a run's environment and algorithm.
+
+    Some defaults follow from other fields: what these would change is among them, too.
+    """
     derived = () if config.capacity_given else ("human_capacity",)
-    return {name: value for name, value in fields.items() if value != default[name] and name not in derived}
+    kept: dict[str, Any] = {}
+    for _ in range(2):
+        again = to_plain(make_config(**own, **kept))
+        kept |= {name: value for name, value in fields.items() if value != again[name] and name not in derived}
+    return kept
 
 
 def processor() -> str:

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Collection
 from typing import Any
 
-from fleetjax.config import FIELDS
+from fleetjax.field import every_field
 from fleetjax.io import flags
 
 
@@ -23,11 +23,16 @@ def add_names(parser: argparse.ArgumentParser, dest: str, known: Collection[str]
 
 
 def parse(parser: argparse.ArgumentParser) -> tuple[argparse.Namespace, dict[str, Any]]:
-    """Parse the command line; return the script's own arguments, and the fields of `Config` that follow `--`."""
+    """Parse the command line; return the script's own arguments, and the parameters of a run that follow `--`."""
     words = sys.argv[1:]
     cut = words.index("--") if "--" in words else len(words)
     try:
-        found = vars(flags.parse(["run", *words[cut + 1 :]]))
+        nothing, found = (vars(flags.parse(["run", *given])) for given in ([], words[cut + 1 :]))
     except flags.Refusal as refusal:
         parser.error(str(refusal))
-    return parser.parse_args(words[:cut]), {name: value for name, value in found.items() if name in FIELDS}
+    known = every_field()
+    others = [name for name, value in found.items() if name not in known and value != nothing.get(name)]
+    if others:
+        named = ", ".join(f"--{name.replace('_', '-')}" for name in others)
+        parser.error(f"only parameters of a run may follow after --, and not {named}")
+    return parser.parse_args(words[:cut]), {name: value for name, value in found.items() if name in known}

@@ -18,8 +18,11 @@ def publish(store: Store) -> Path:
     """Write the table and the figure of all that is stored, or remove them if nothing is; return the table's path."""
     page, picture = store.rows.with_suffix(".md"), store.rows.with_suffix(".png")
     if store.runs:
-        files.write(page, table(store).encode())
-        files.write(picture, draw(store))
+        if not any(store.group_of(place) for place in store.places):
+            raise ValueError(f"{store.rows} has runs, but {store.table} has no calibrations of theirs; restore that file")
+        shown, drawn = table(store).encode(), draw(store)
+        files.write(page, shown)
+        files.write(picture, drawn)
     else:
         page.unlink(missing_ok=True)
         picture.unlink(missing_ok=True)

@@ -264,6 +264,7 @@ def plan(study: Study) -> list[folder.Run]:
         expect(twice[1] == 1, f"{runs[same.index(twice[0])].folder.name} is in the sweep twice; omit one")
     for run in {program((run,)): run for run in reversed(runs)}.values():
         with _naming(run.folder.name):
+            folder.check_config(run.config)
             check_plan(run.config, copies=study.seeds_per_program)
     return runs
 

@@ -1,8 +1,11 @@
 """A run in its folder, by several processes or devices together: as `resumable` does for one."""
 
 import contextlib
+import time
+import uuid
 from collections.abc import Callable, Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -46,9 +49,37 @@ def complete(run: folder.Run, *, checkpoint_every: int, step_timeout: int) -> Me
         except ValueError as error:
             raise Refusal(str(error)) from error
         begun = team.led(lambda: _look(run, stack))
+        _check_shared(run.folder)
         if begun["finished"]:
             return folder.read_finished(folder.read_run(run.folder)) if team.leads() else None
         return _run(run, begun, checkpoint_every, beat, again)
+
+
+def _check_shared(path: Path) -> None:
+    """Check that all processes have the same folder: each must see what the one that leads puts there.
+
+    Raises:
+        Refusal: if one does not.
+    """
+    mark = path / f".seen-{team.led(lambda: _leave_mark(path))}"
+    until = time.monotonic() + 3
+    while not (seen := mark.exists()) and time.monotonic() < until:  # NFS shows new files late
+        time.sleep(0.1)
+    blind = [number for number, sees in enumerate(team.tell(seen)) if not sees]
+    if team.leads():
+        mark.unlink(missing_ok=True)
+    if blind:
+        names = ", ".join(map(str, blind))
+        raise Refusal(
+            f"process {names} does not see the folder of process 0; give all processes the same --output, on a file system "
+            "that they share"
+        )
+
+
+def _leave_mark(path: Path) -> str:
+    token = uuid.uuid4().hex
+    (path / f".seen-{token}").touch()
+    return token
 
 
 def _look(run: folder.Run, stack: contextlib.ExitStack) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 
 from fleetjax.allocation import Allocator, allocate
-from fleetjax.field import PARAMETERS, Field
+from fleetjax.field import FIELDS, PARAMETERS, Field
 from fleetjax.registry import Registry
 from fleetjax.types import Signals
 
@@ -82,8 +82,13 @@ def register_algorithm(name: str, algorithm: Algorithm) -> None:
     """Make an algorithm available to `make_config` under `name`.
 
     Raises:
-        ValueError: if the name is taken.
+        ValueError: if the name is taken, or a parameter has the name of a field of `Config` or is no `Field`.
     """
+    for parameter, field in algorithm.parameters.items():
+        if parameter in FIELDS:
+            raise ValueError(f"parameter {parameter!r} of {name!r} is a field of Config already; choose another name")
+        if not isinstance(field, Field):
+            raise ValueError(f"parameter {parameter!r} of {name!r} must be a fleetjax.field.Field, with its help and default")
     ALGORITHMS.register(name, algorithm)
     PARAMETERS[name] = algorithm.parameters
 
@@ -106,8 +111,10 @@ def register_priority(
         differentiable: whether its scores have derivatives with respect to its parameters; see `Algorithm`.
 
     Raises:
-        ValueError: if the name is taken.
+        ValueError: as `register_algorithm`, and if `estimators` is one text.
     """
+    if isinstance(estimators, str):
+        raise ValueError(f"estimators = {estimators!r} must be a tuple of names: ({estimators!r},)")
     own = dict(parameters or {})
     algorithm = Algorithm(make_priority, estimators=tuple(estimators), parameters=own, differentiable=differentiable)
     register_algorithm(name, algorithm)

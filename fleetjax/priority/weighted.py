@@ -9,6 +9,7 @@ from fleetjax.field import PARAMETERS
 from fleetjax.priority.base import Algorithm, Priority, stateless
 from fleetjax.priority.ranks import above, softly_above
 
+SMALLEST = 1e-6  # threshold that values are divided by
 _THRESHOLDS = ("uncertainty_threshold", "risk_threshold")
 
 
@@ -25,6 +26,7 @@ def weighted(config) -> Priority:
     soft = config.allocation == "soft"
 
     def part(weight: jax.Array, values: jax.Array, threshold: jax.Array) -> jax.Array:
+        threshold = jnp.maximum(threshold, SMALLEST)  # one that is traced may be 0
         if soft:
             return softly_above(weight * values / threshold, weight, config.temperature)
         return weight * above(values, threshold) / threshold

@@ -14,6 +14,8 @@ import time
 import pytest
 from commands import own_lines
 
+from fleetjax import cli
+
 SMALL = {
     "--num-robots": 40,
     "--num-humans": 5,
@@ -267,6 +269,29 @@ def test_processes_that_differ_are_refused(tmp_path):
         assert code == 2
         assert "random_threshold = 0.6 in process 1, but 0.5 in process 0" in errors
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+def test_processes_with_other_folders_are_refused(tmp_path):
+    port = free_port()
+    started = [command(tmp_path / f"run-{i}", port=port, processes=2, process=i, devices=1) for i in range(2)]
+    for code, errors in finish(started):
+        assert code == 2
+        assert "process 1 does not see the folder of process 0; give all processes the same --output" in errors
+    assert not any(path.is_file() for path in tmp_path.rglob("*"))
+
+
+@pytest.mark.slow
+def test_one_process_says_how_a_run_on_many_devices_is_resumed(tmp_path, capsys):
+    (started,) = start(tmp_path / "run", 1, 2, algorithm="cur", num_steps=100_000, **CRITICS)
+    while not list(tmp_path.glob("run/checkpoints/*/manifest.json")) and started.poll() is None:
+        time.sleep(0.05)
+    started.send_signal(signal.SIGINT)
+    ((code, errors),) = finish([started])
+    assert code == 130, errors
+    assert cli.main(["run", "--resume", str(tmp_path / "run")]) == 2
+    reason = capsys.readouterr().err.splitlines()[-1]
+    assert reason == f"fleetjax: {tmp_path / 'run'} was run with --distributed on 2 devices; repeat that command to resume it"
 
 
 @pytest.mark.slow

@@ -48,8 +48,9 @@ def complete(run: folder.Run, *, checkpoint_every: int, step_timeout: int) -> Me
             team.check_agreement(facts)
         except ValueError as error:
             raise Refusal(str(error)) from error
-        begun = team.led(lambda: _look(run, stack))
+        team.led(lambda: _lock(run.folder, stack))
         _check_shared(run.folder)
+        begun = team.led(lambda: _look(run))
         if begun["finished"]:
             return folder.read_finished(folder.read_run(run.folder)) if team.leads() else None
         return _run(run, begun, checkpoint_every, beat, again)
@@ -82,10 +83,14 @@ def _leave_mark(path: Path) -> str:
     return token
 
 
-def _look(run: folder.Run, stack: contextlib.ExitStack) -> dict[str, Any]:
-    """Lock the folder, and return what it holds: a finished run, a checkpoint, or nothing."""
-    run.folder.mkdir(parents=True, exist_ok=True)
-    stack.enter_context(files.lock(run.folder))
+def _lock(path: Path, stack: contextlib.ExitStack) -> None:
+    """Make the folder, if it is not there, and lock it until the stack ends."""
+    path.mkdir(parents=True, exist_ok=True)
+    stack.enter_context(files.lock(path))
+
+
+def _look(run: folder.Run) -> dict[str, Any]:
+    """Return what the folder holds: a finished run, a checkpoint, or nothing."""
     if not folder.is_run(run.folder):
         folder.check_folder(run.folder, overwrite=False)
         folder.prepare(run)

@@ -23,6 +23,7 @@ from fleetjax.io.progress import progress, say
 from fleetjax.metrics import Metrics, first_divergence
 from fleetjax.priority import get_algorithm
 
+PATIENCE = 20.0  # seconds until every process should see a new file of another's
 _prepare = jax.jit(prepare, static_argnames="mesh")
 
 
@@ -63,17 +64,16 @@ def _check_shared(path: Path) -> None:
         Refusal: if one does not.
     """
     mark = path / f".seen-{team.led(lambda: _leave_mark(path))}"
-    until = time.monotonic() + 3
+    until = time.monotonic() + PATIENCE
     while not (seen := mark.exists()) and time.monotonic() < until:  # NFS shows new files late
         time.sleep(0.1)
     blind = [number for number, sees in enumerate(team.tell(seen)) if not sees]
     if team.leads():
         mark.unlink(missing_ok=True)
     if blind:
-        names = ", ".join(map(str, blind))
+        who = f"process {blind[0]} does" if len(blind) == 1 else f"processes {', '.join(map(str, blind))} do"
         raise Refusal(
-            f"process {names} does not see the folder of process 0; give all processes the same --output, on a file system "
-            "that they share"
+            f"{who} not see the folder of process 0; give all processes the same --output, on a file system that they share"
         )
 
 

@@ -5,8 +5,8 @@
 
 A variant helps moving robots up to timestep T, chosen in some way. It resets robots before it helps others (`first`), after
 that (`last`), or not at all up to T / 2 and then first (`half`). Variants whose name begins with `teach` are Teach First with
-one thing changed; give them `--teaching-time` after `--` instead of T (5,500 by default). Other parameters of `fleetjax run`
-may follow there, too. Prints a row for each run.
+one thing changed; T does not apply to them, but `--teaching-time` (5,500 by default), after `--`. Other parameters of
+`fleetjax run` may follow there, too. Prints a row for each run.
 """
 
 import argparse

@@ -81,8 +81,8 @@ def check_single(config: Config) -> None:
     for name, field in all_fields(config.algorithm).items():
         shapes = [jnp.shape(value) for value in jax.tree.leaves(get_value(config, name))] if field.traced else []
         if any(shapes):
-            each = "; for a value for each human, use a tuple" if field.per_human else ""
-            raise ValueError(f"{name} has shape {max(shapes)}, but a run has one value; use jax.vmap over several{each}")
+            each = "; to give each human a value, pass a tuple" if field.per_human else ""
+            raise ValueError(f"{name} has shape {max(shapes)}, but a run takes one value; for a sweep, use jax.vmap{each}")
 
 
 def check_mesh(config: Config) -> None:
@@ -169,13 +169,15 @@ def memory() -> int:
 
 
 def check_key(key: Any) -> None:
-    """Check that a key is one.
+    """Check that an argument is a single JAX key.
 
     Raises:
         ValueError: if it is not.
     """
     if not (isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and not key.ndim):
-        raise ValueError("key must be one key, jax.random.key(0); use jax.vmap or jax.lax.map over several")
+        raise ValueError(
+            "key must be a single JAX key, such as jax.random.key(0); for several keys, use jax.vmap or jax.lax.map"
+        )
 
 
 def check_kind(what: str, value: Any, kind: type, remedy: str) -> None:
@@ -185,7 +187,7 @@ def check_kind(what: str, value: Any, kind: type, remedy: str) -> None:
         ValueError: if it is something else.
     """
     if value is not None and not isinstance(value, kind):
-        raise ValueError(f"{what} is a {type(value).__name__}, and must be a {kind.__name__}: {remedy}")
+        raise ValueError(f"{what} must be of type {kind.__name__}, not {type(value).__name__}; pass {remedy}")
 
 
 def check_state(config: Config, env: Env, state: FleetState, shapes: FleetState) -> None:
@@ -226,7 +228,7 @@ def _other_structure(config: Config, made_for: str) -> str:
     """Return the message for a state with another structure than a run needs."""
     if config.algorithm == made_for:
         differ = "allocation, hidden_sizes, estimators, human_model, link_model"
-        return f"the state has another structure than this configuration needs ({differ}); {_REMEDY}"
+        return f"the state does not have the structure that this configuration needs ({differ}); {_REMEDY}"
     return (
         f"algorithm = {config.algorithm!r} keeps other estimators or another memory than {made_for!r}, for which the state was "
         f"prepared; {_REMEDY}"

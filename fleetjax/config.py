@@ -256,7 +256,7 @@ def check_one_for_all(config: Config, name: str) -> None:
         ValueError: if it has a tuple, a value for each.
     """
     if isinstance(get_value(config, name), tuple):
-        raise ValueError(f"{name} has a value for each human, and only one for all can be changed; pass one number")
+        raise ValueError(f"{name} has a value for each human; only a single number can be tuned or differentiated")
 
 
 def validate(config: Config, env: "envs.Env | None" = None) -> None:

@@ -222,7 +222,7 @@ PARAMETERS: dict[str, Mapping[str, Field]] = {
     },
     "whittle": {
         "whittle_threshold": Field("index, as worth of a timestep of help, at or below which no robot is helped", default=0.1),
-        "whittle_discount": Field("what the next timestep counts", high=0.99, default=0.99),
+        "whittle_discount": Field("discount per timestep", high=0.99, default=0.99),
     },
     "asa": {
         "asa_threshold": Field("gain in coverage below which nobody else is helped", default=0.351),

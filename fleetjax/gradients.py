@@ -43,8 +43,8 @@ class Sensitivity(NamedTuple):
     Attributes:
         value: f32[] the objective.
         gradient: f32[] by field, its derivative.
-        standard_error: f32[] by field, of the gradient; NaN for one key, unless `"smoothed"` has more than two samples of which
-            some differ.
+        standard_error: f32[] by field, of the gradient; NaN for one key, except with `"smoothed"` and more than two samples
+            that are not all equal.
     """
 
     value: jax.Array
@@ -83,8 +83,8 @@ def sensitivity(
             algorithms with differentiable scores such as `weighted`. `"forward"`: forward mode through the run as configured,
             one field after the other. For environments on MJX, too.
         width: of the noise in `"smoothed"`, its standard deviation: a fraction of each field's value (0.1 if None), or a
-            mapping from fields to widths themselves. Shifted values beyond a field's range count as its bound: at a bound the
-            derivative is that of the clipped objective, half of the one-sided slope.
+            mapping from fields to widths themselves. Shifted values are clipped to the field's range; at a bound the
+            derivative is half of the one-sided slope.
         num_samples: shifted runs for each key in `"smoothed"`, an even number.
         env: the environment, if it is not the registered one that the configuration names.
 

@@ -23,9 +23,9 @@ class HumanModel(NamedTuple):
     Attributes:
         init: `(config, key) -> aux`, at t = 0.
         available: `(aux, key) -> bool[M]`, the humans who are there.
-        act: `(aux, Plan, action f32[N, A], key) -> (aux, action f32[N, A], given bool[N])`: what humans really do, of what the
-            supervisor would do, and on which robots. On the others their own policy acts, and nothing is recorded. Its key is
-            another than that of `available`.
+        act: `(aux, Plan, action f32[N, A], key) -> (aux, action f32[N, A], given bool[N])`: turns the supervisor's actions into
+            what humans really do, and says on which robots they act. On the others their own policy acts, and nothing is
+            recorded. Its key differs from that of `available`.
         unready: `aux -> i32[M]`, timesteps of the current intervention that each human spent taking over; they do not count
             towards t_T, the shortest teleoperation. None = 0.
     """
@@ -79,8 +79,7 @@ def make_imperfect(config: Any, spec: EnvSpec) -> HumanModel:
     - Takeover: a human acts on a new robot only after a takeover time, and `switching_lag` more after another robot. The sum is
       rounded up or down by chance, so that its mean is kept. Meanwhile the robot's policy acts, and the human's time counts.
       The shortest teleoperation t_T starts after the takeover. Hard resets take t_R, as ever.
-    - Delay: the action is the one for what the robot was in `action_delay` timesteps ago, a whole number, but not before its
-      last reset.
+    - Delay: the human reacts to the robot's state of `action_delay` timesteps ago (rounded), or to its first after a reset.
     - Skill: normal noise on continuous actions, and a random action in its place with `mistake_rate`.
     - Fatigue: takeover time and noise are multiplied by 1 + `fatigue` b, for the share b of recent time in which the human was
       busy.

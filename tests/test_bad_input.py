@@ -148,18 +148,18 @@ def test_arguments_of_another_kind_are_refused():
     config = fleetjax.make_config("navigation", num_robots=4, num_humans=2, num_steps=3)
     key = jax.random.key(0)
     calls = {
-        "key must be one key": (
+        "key must be a single JAX key": (
             lambda: fleetjax.run(config, jax.random.PRNGKey(0)),
             lambda: fleetjax.run(config, 0),  # type: ignore[arg-type]
             lambda: fleetjax.prepare(config, jax.random.split(key)),
         ),
-        "state is a Config, and must be a FleetState: what prepare returns": (
+        "state must be of type FleetState, not Config; pass what prepare returns": (
             lambda: fleetjax.run(config, key, config),  # type: ignore[arg-type]
         ),
-        r"env is a str, and must be a Env: fleetjax.envs.make\(name\)": (
+        r"env must be of type Env, not str; pass fleetjax.envs.make\(name\)": (
             lambda: fleetjax.run(config, key, env="navigation"),  # type: ignore[arg-type]
         ),
-        "policy is a Config, and must be a PolicyState": (lambda: fleetjax.evaluate(config, key, config),),  # type: ignore[arg-type]
+        "policy must be of type PolicyState, not Config": (lambda: fleetjax.evaluate(config, key, config),),  # type: ignore[arg-type]
     }
     for message, wrong in calls.items():
         for call in wrong:

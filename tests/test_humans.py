@@ -453,10 +453,10 @@ def test_a_rate_of_links_chooses_their_model():
     assert fleetjax.make_config("navigation", "cur").link_model == "perfect"
 
 
-@pytest.mark.parametrize(("name", "remedy"), [("takeover_time", "use a tuple"), ("uncertainty_threshold", "use jax.vmap")])
+@pytest.mark.parametrize(("name", "remedy"), [("takeover_time", "pass a tuple"), ("uncertainty_threshold", "use jax.vmap")])
 def test_several_values_without_vmap_are_refused(name, remedy):
     config = fleetjax.make_config("navigation", **{name: np.array([1.0, 2.0, 3.0])})
-    with pytest.raises(ValueError, match=rf"{name} has shape \(3,\), but a run has one value.*{remedy}"):
+    with pytest.raises(ValueError, match=rf"{name} has shape \(3,\), but a run takes one value.*{remedy}"):
         fleetjax.run(config, jax.random.key(0))
 
 

@@ -58,7 +58,7 @@ def run_fleet(arguments: argparse.Namespace) -> None:
         return
     for name in ("coordinator", "num_processes", "process_id"):
         if getattr(arguments, name) is not None:
-            raise Refusal(f"--{name.replace('_', '-')} has no effect without --distributed; add it, or omit this")
+            raise Refusal(f"--{name.replace('_', '-')} needs --distributed; add --distributed, or omit it")
     with _refusing():
         resumable.check_interval(arguments.checkpoint_every)
         run = _run_to_resume(arguments, given) if arguments.resume else _new_run(arguments, given)
@@ -428,7 +428,7 @@ def lead(arguments: argparse.Namespace) -> None:
             for entry in entries:
                 leaderboard.compete(store, entry)
             page = standings.publish(store)
-            print(page if store.runs else "no runs are stored any more")
+            print(page if store.runs else "no stored runs are left")
 
 
 COMMANDS: Mapping[str, Callable[[argparse.Namespace], None]] = {

@@ -251,7 +251,8 @@ def compete(store: Store, entry: Entry) -> None:
     known = {folder.name_of(run) for run in store.runs}
     stored = sum(folder.name_of(folder.Run(Path(), config, seed)) in known for seed in range(entry.seeds))
     if stored:
-        say(f"{text.label(entry.algorithm)} has {text.plural(stored, 'stored run')} on {entry.environment} at {entry.budget:,}")
+        where = f"{text.label(entry.algorithm)} on {entry.environment} at {entry.budget:,} human timesteps"
+        say(f"{where}: {text.plural(stored, 'run')} already stored, and not repeated")
     for seed in range(entry.seeds):
         run = folder.Run(entry.folder / f"{name}-seed{seed}", config, seed)
         if folder.name_of(run) not in known:

@@ -111,7 +111,7 @@ def register_priority(
         differentiable: whether its scores have derivatives with respect to its parameters; see `Algorithm`.
 
     Raises:
-        ValueError: as `register_algorithm`, and if `estimators` is one text.
+        ValueError: as `register_algorithm`, and if `estimators` is a string.
     """
     if isinstance(estimators, str):
         raise ValueError(f"estimators = {estimators!r} must be a tuple of names: ({estimators!r},)")

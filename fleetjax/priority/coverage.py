@@ -21,8 +21,8 @@ def asa(config) -> Priority:
 
     U and R count as 0 below `asa_uncertainty` and `asa_risk`. Their defaults and the other numbers are those of the published
     code's settings file, tuned to its own ensemble and critic; its scripts have others for each robot. In the initial period
-    robots in violation score 0, and nobody helps them. It is `initial_period`; the original's is 2,000 timesteps, in which it
-    subtracts 10,000, but may still pick such a robot for the sake of its neighbours.
+    (`initial_period`; 2,000 timesteps in the original) robots in violation score 0, and nobody helps them. The original only
+    subtracts 10,000, so it may still pick such a robot to cover its neighbours.
 
     Reference: Akcin et al., Fleet supervisor allocation: a submodular maximization approach (ASA), 2024, and its published
     code.

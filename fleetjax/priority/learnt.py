@@ -25,8 +25,8 @@ def crsail(config) -> Priority:
     """Ask if d_K / r >= `crsail_threshold`, for the distance d_K to the K-th nearest state in which humans acted.
 
     The radius r is the quantile at level 1 - `crsail_rate` of the same distance among the demonstrated states, calibrated
-    once, before the fleet starts. See the estimator `"novelty"`. In the original the quantile is that of distances which
-    the policy itself met, so that its level sets the rate of queries; here the threshold does.
+    once, before the fleet starts. See the estimator `"novelty"`. The original takes the quantile over states that the
+    policy visits, so its level sets the rate of queries. Here `crsail_threshold` does.
 
     Reference: CRSAIL, 2025 (arXiv 2512.00453: K = 5); reimplemented from the text.
     """

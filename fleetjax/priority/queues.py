@@ -10,7 +10,7 @@ from fleetjax.priority.gates import helped
 def round_robin(config) -> Priority:
     """Help the robot that has been without help longest, but none within `round_robin_threshold` timesteps of its last help.
 
-    At the start, robot i counts as having waited N + 1 - i timesteps.
+    At its first score, robot i (from 0) counts as having waited N + 1 - i timesteps.
     """
     threshold = config.parameters["round_robin_threshold"]
 

@@ -159,7 +159,7 @@ def test_extend_takes_several_fleets_and_refuses_nonsense(config):
         ("block_push", "uc", {}, "environment = 'block_push', but the state was prepared for 'navigation'"),
         ("navigation", "cur", {}, "algorithm = 'cur' keeps other estimators or another memory than 'uc'"),
         ("navigation", "thrifty_dagger", {}, "algorithm = 'thrifty_dagger' keeps other estimators or another memory than 'uc'"),
-        ("navigation", "uc", {"hidden_sizes": (4, 4)}, r"another structure .*\(hidden_sizes, estimators\); call prepare with"),
+        ("navigation", "uc", {"hidden_sizes": (4, 4)}, r"structure that .*, hidden_sizes, estimators, .*; call prepare with"),
         ("navigation", "uc", {"hidden_sizes": (5,)}, r"its \.policy\.params.*float32\[2, 4\]; expected float32\[2, 5\]"),
     ],
 )

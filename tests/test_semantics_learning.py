@@ -7,12 +7,13 @@ import pytest
 import toy_envs
 from compiling import compiled
 from reference.scenario import play
-from toy_envs import NEVER
+from toy_envs import ALWAYS, NEVER
 
 import fleetjax
 from fleetjax import priority, supervisors
 from fleetjax.envs import EnvSpec
 from fleetjax.learning import critic, imitation
+from fleetjax.learning.buffer import is_buffer
 from fleetjax.learning.networks import Normalizer
 from fleetjax.learning.pretraining import collect_demonstrations
 
@@ -204,6 +205,29 @@ def test_semantic_18_a_member_learns_from_its_own_resample_only():
     after, loss = compiled(learner.update)(state, data, jax.random.key(0))
     np.testing.assert_allclose(last_bias(after.params), [3e-4, -3e-4], rtol=1e-3)  # Adam's first step is the learning rate
     assert float(loss) == pytest.approx(1.0)
+
+
+def test_semantic_8_robots_that_start_in_violation_are_not_driven_before_the_fleet_starts():
+    env = toy_envs.scripted([ALWAYS, NEVER, NEVER, ALWAYS], [NEVER] * 4, horizon=6)
+    small = {"num_demonstrations": 24, "num_critic_transitions": 48, "batch_size": 4, "hidden_sizes": (1,)}
+    config = fleetjax.make_config(env, "cur", num_robots=4, num_humans=2, num_steps=1, **small)
+    state = compiled(lambda config, key: fleetjax.prepare(config, key, env))(config, jax.random.key(0))
+    pairs = state.human_data.pairs
+    assert int(pairs.size) == 24
+    assert np.unique(pairs.rows.obs[:24, 0]).tolist() == [1, 2]
+    safety = [x for x in jax.tree.leaves(state.estimators["safety"], is_leaf=is_buffer) if is_buffer(x)]
+    seen = np.concatenate([np.asarray(x.rows.obs[: int(x.size), 0]) for x in safety])
+    assert len(seen) > 12
+    assert set(seen.tolist()) == {1.0, 2.0}
+
+
+def test_demonstrations_end_where_all_robots_start_in_violation():
+    env = toy_envs.scripted([ALWAYS] * 2, [NEVER] * 2, horizon=6)
+    config = fleetjax.make_config(
+        env, num_robots=2, num_humans=1, num_steps=1, batch_size=4, hidden_sizes=(1,), num_demonstrations=24
+    )
+    state = compiled(lambda config, key: fleetjax.prepare(config, key, env))(config, jax.random.key(0))
+    assert int(state.human_data.pairs.size) == 0
 
 
 def test_semantic_19_demonstrations_are_whole_episodes_the_last_one_cut():

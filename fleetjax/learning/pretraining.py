@@ -12,6 +12,7 @@ from fleetjax.tree import where
 from fleetjax.types import EnvState
 
 LANES = 8  # episodes that are demonstrated side by side
+TURNS = 100  # of all robots, after which a fleet without any demonstration gives up
 MOST_LANES = 100  # robots that give offline transitions side by side
 BURST = 20  # timesteps of offline transitions between two looks at their number
 
@@ -20,6 +21,8 @@ def collect_demonstrations(
     config: Config, env: Env, supervisor: supervisors.Supervisor, add, data: imitation.HumanData, key: jax.Array
 ) -> imitation.HumanData:
     """Fill `data` with supervisor actions from whole episodes of all robots in turn, the last one cut at the number asked for.
+
+    Robots that start in violation do not move, and demonstrate nothing. If all do, again and again, `data` stays empty.
 
     Args:
         config: configuration.
@@ -47,7 +50,7 @@ def collect_demonstrations(
         keys = jax.random.split(jax.random.fold_in(key, count), 1 + LANES * (1 + 3 * env.spec.horizon))
         key_data, keys_reset, keys_steps = keys[0], keys[1 : 1 + LANES], keys[1 + LANES :]
         start = jax.vmap(env.reset)(keys_reset, robots)
-        _, (pairs, valid) = jax.lax.scan(step, (start, jnp.ones(LANES, bool)), keys_steps.reshape(-1, 3, LANES))
+        _, (pairs, valid) = jax.lax.scan(step, (start, ~start.violation), keys_steps.reshape(-1, 3, LANES))
         # Episode after episode, each in order of time.
         pairs, valid = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]), (pairs, valid))
         valid &= data.pairs.added // config.augmented_copies + jnp.cumsum(valid) <= wanted
@@ -56,13 +59,20 @@ def collect_demonstrations(
     wanted = config.num_demonstrations + config.extra_demonstrations
     copies = wanted * config.augmented_copies
     limit = jnp.minimum(copies, data.pairs.capacity)
-    unfinished = lambda carry: carry[0].pairs.added < limit  # noqa: E731
+    enough = TURNS * -(-config.num_robots // LANES)
+
+    def unfinished(carry: tuple[imitation.HumanData, jax.Array]) -> jax.Array:
+        added = carry[0].pairs.added
+        return (added < limit) & ((added > 0) | (carry[1] < enough))
+
     data, _ = jax.lax.while_loop(unfinished, episodes, (data, jnp.int32(0)))
     return data._replace(dropped=jnp.asarray(copies - data.pairs.added, jnp.int32))
 
 
 def collect_transitions(config: Config, env: Env, act, add, store: critic.CriticState, key: jax.Array) -> critic.CriticState:
-    """Add about `num_critic_transitions` steps of a fleet under noisy actions; who ends an episode is reset at once.
+    """Add at most `num_critic_transitions` steps of a fleet under noisy actions; who ends an episode is reset at once.
+
+    They are fewer where robots start in violation, since these do not move.
 
     In fleets of more than `MOST_LANES` robots, that many move at a time, and the end of an episode is the next one's turn.
 
@@ -84,9 +94,9 @@ def collect_transitions(config: Config, env: Env, act, add, store: critic.Critic
         action = disturb(config, env, act(state, key_act), key_noise)
         after = jax.vmap(env.step)(state, action, jnp.ones(num_lanes, bool), keys_env)
         transition = critic.Transition(state.obs, action, after.obs, after.violation, after.success)
-        wanted = count + lanes < config.num_critic_transitions
+        wanted = (count + lanes < config.num_critic_transitions) & ~state.violation
         store = add(store, transition, wanted)
-        ended = after.violation | after.timeout | after.success
+        ended = state.violation | after.violation | after.timeout | after.success
         robots = jnp.where(ended, (robots + num_lanes) % config.num_robots, robots)
         return (after, ended, store, count + num_lanes, robots), None
 

@@ -703,7 +703,7 @@ def test_the_targets_and_the_loss_of_the_proxy_value(monkeypatch):
     assert loss_of_update(monkeypatch, parts, state, "intervention", key) == pytest.approx(expected, rel=1e-4)
 
 
-@pytest.mark.parametrize("environment", ["navigation", "block_push"])
+@pytest.mark.parametrize("environment", ["navigation", pytest.param("block_push", marks=pytest.mark.slow)])
 def test_the_loss_of_the_energy_models(monkeypatch, environment):
     """Each learns by telling the human's action from proposals; where actions are discrete, these are all of them."""
     parts, state = taught_fleet("iifl", environment)

@@ -232,6 +232,7 @@ def test_a_robot_keeps_the_share_that_it_had_while_its_human_is_bound_to_it(conf
     np.testing.assert_allclose(found, jnp.where(jnp.arange(5) == 2, 0.3, soft_top_k(score.at[2].set(0), 1, 0.1)), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_pairs_of_a_soft_fleet_count_by_its_shares_and_it_continues_from_its_states(config):
     config = config.replace(allocation="soft", temperature=20.0, uncertainty_threshold=0.01)
     fleet, state = fleetjax.make_fleet(config, fleetjax.envs.make("navigation")), compiled(fleetjax.prepare)(config, KEYS[0])

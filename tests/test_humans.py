@@ -232,6 +232,7 @@ def test_humans_with_their_own_values_are_swept_together():
     np.testing.assert_array_equal(jax.vmap(waits)(jnp.array([1.0, 3.0])), [[0, 2, 4], [0, 6, 12]])
 
 
+@pytest.mark.slow
 def test_who_is_there_and_what_they_do_are_drawn_apart(monkeypatch):
     keys = {}
 

@@ -200,7 +200,7 @@ def is_any_finished(folder: Path) -> bool:
 def parts(folder: Path) -> int:
     """Return over how many devices the fleet of the newest finished checkpoint was divided; 1 if that is not known."""
     for path in reversed(_found(folder / FOLDER)):
-        with contextlib.suppress(OSError, ValueError, AttributeError, TypeError):
+        with contextlib.suppress(Exception):  # it may be damaged in any way
             return int(json.loads((path / MANIFEST).read_text()).get("parts", 1))
     return 1
 

@@ -168,13 +168,18 @@ def memory() -> int:
     return min([machine, *(int(limit) for limit in limits if limit.isdecimal())])
 
 
+def is_key(value: Any) -> bool:
+    """Return whether a value is a JAX key, or an array of them."""
+    return isinstance(value, jax.Array) and bool(jnp.issubdtype(value.dtype, jax.dtypes.prng_key))
+
+
 def check_key(key: Any) -> None:
     """Check that an argument is a single JAX key.
 
     Raises:
         ValueError: if it is not.
     """
-    if not (isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and not key.ndim):
+    if not is_key(key) or key.ndim:
         raise ValueError(
             "key must be a single JAX key, such as jax.random.key(0); for several keys, use jax.vmap or jax.lax.map"
         )

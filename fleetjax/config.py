@@ -344,8 +344,9 @@ def _check_absence(config: Config) -> None:
     Raises:
         ValueError: if an absence would have to be longer.
     """
-    for i in range(config.num_humans):
-        pair = [value[i] if isinstance(value, tuple) else value for value in (config.absence, config.absence_time)]
+    both = (config.absence, config.absence_time)
+    for i in range(config.num_humans if any(isinstance(value, tuple) for value in both) else 1):
+        pair = [value[i] if isinstance(value, tuple) else value for value in both]
         if not all(map(_is_concrete, pair)):
             continue
         share, time = (np.asarray(value, np.float32) for value in pair)

@@ -27,12 +27,12 @@ from fleetjax.field import OFFLINE, Field
 from fleetjax.fleet import FleetState
 from fleetjax.metrics import Metrics, rohe
 from fleetjax.precision import in_32_bits
+from fleetjax.priority.weighted import SMALLEST
 from fleetjax.registry import unknown
 
 METHODS = ("smoothed", "relaxed", "forward")
 WIDTH = 0.1  # deviation of perturbations, in units of a field's value
 STEPS, _NOISE = 2**32 - 2, 2**32 - 1  # folded into a run's key for tuning and for noise; `keys.key_at` folds in timesteps
-_SMALLEST = 1e-6  # of a shifted field whose lower bound is 0, since some are divided by
 Objective = Callable[[Metrics, Config], jax.Array]
 Values = dict[str, jax.Array]
 
@@ -247,7 +247,7 @@ def within_range(field: Field, value: jax.Array) -> jax.Array:
     """Return a value as a field can hold it: within its range, and whole if need be."""
     if field.kind is int:
         return jnp.round(jnp.clip(value, field.low, field.high)).astype(jnp.int32)
-    return jnp.clip(value, _SMALLEST if field.low == 0 else field.low, field.high)
+    return jnp.clip(value, SMALLEST if field.low == 0 else field.low, field.high)  # some are divided by
 
 
 def _standard_error(gradients: jax.Array, variances: jax.Array) -> jax.Array:
@@ -261,7 +261,7 @@ def _standard_error(gradients: jax.Array, variances: jax.Array) -> jax.Array:
 
 def _as_keys(keys: jax.Array) -> jax.Array:
     """Return keys [S]."""
-    if not (isinstance(keys, jax.Array) and jnp.issubdtype(keys.dtype, jax.dtypes.prng_key) and keys.ndim < 2 and keys.size):
+    if not (checks.is_key(keys) and keys.ndim < 2 and keys.size):
         raise ValueError("keys must be a key or an array of keys: jax.random.split(jax.random.key(0), 8)")
     return keys.reshape(-1)
 
@@ -289,7 +289,7 @@ def _widths(config: Config, names: Sequence[str], width: float | Mapping[str, fl
     unknown_names = set(given) - set(names)
     if unknown_names:
         raise ValueError(f"width names {', '.join(sorted(unknown_names))}, which fields does not have")
-    if not all(map(_is_finite, given.values() if isinstance(width, Mapping) else [0 if width is None else width])):
+    if not all(map(is_finite, given.values() if isinstance(width, Mapping) else [0 if width is None else width])):
         raise ValueError(f"width = {width!r} must be a finite number, or a mapping from fields to such numbers")
     share = WIDTH if width is None or isinstance(width, Mapping) else width
     widths = {name: given[name] if name in given else share * abs(_concrete(config, name)) for name in names}
@@ -299,7 +299,7 @@ def _widths(config: Config, names: Sequence[str], width: float | Mapping[str, fl
     return {name: jnp.float32(found) for name, found in widths.items()}
 
 
-def _is_finite(value: Any) -> bool:
+def is_finite(value: Any) -> bool:
     """Return whether a value is a finite number, or may be one, since it is traced."""
     try:
         return isinstance(value, Tracer) or (not isinstance(value, str) and math.isfinite(value))

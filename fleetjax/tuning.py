@@ -5,14 +5,23 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from jax.core import Tracer
 
 from fleetjax.config import Config, all_fields, get_value
 from fleetjax.envs import Env
 from fleetjax.experiment import prepare
-from fleetjax.gradients import STEPS, Objective, Values, check_request, final_return, is_whole, make_gradient, within_range
+from fleetjax.gradients import (
+    STEPS,
+    Objective,
+    Values,
+    check_request,
+    final_return,
+    is_finite,
+    is_whole,
+    make_gradient,
+    within_range,
+)
 from fleetjax.precision import in_32_bits
 
 
@@ -69,7 +78,7 @@ def tune(
     """
     if not is_whole(steps) or steps < 1:
         raise ValueError(f"steps = {steps!r} must be a whole number, and at least 1")
-    if not isinstance(learning_rate, Tracer) and not (np.isfinite(learning_rate) and learning_rate > 0):
+    if not is_finite(learning_rate) or (not isinstance(learning_rate, Tracer) and learning_rate <= 0):
         raise ValueError(f"learning_rate = {learning_rate!r} must be a finite number above 0")
     request, hard = check_request(config, keys, fields, objective or final_return, method, width, num_samples, env), config
     config, env, names = request.config, request.env, request.names

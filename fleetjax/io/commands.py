@@ -310,8 +310,7 @@ def export_interventions(arguments: argparse.Namespace) -> None:
         formats.check(arguments.format)
         run = folder.read_run(arguments.run)
         found = folder.read_interventions(run)
-    name = "robomimic.hdf5" if arguments.format == "robomimic" else arguments.format
-    output = arguments.output or run.folder / name
+    output = arguments.output or run.folder / formats.PLACES[arguments.format]
     files.check_free(output, overwrite=arguments.overwrite, is_folder=arguments.format != "robomimic")
     with _refusing():
         export.export(found, run.config, envs.make(run.config.environment, run.config.backend).spec, output, arguments.format)
@@ -410,9 +409,8 @@ def lead(arguments: argparse.Namespace) -> None:
     from fleetjax.io import leaderboard, standings
 
     with _refusing():
-        if not leaderboard.Store(arguments.results).rows.parent.is_dir() or (
-            arguments.action != "add" and not leaderboard.Store(arguments.results).runs
-        ):
+        may_be_empty = arguments.action == "add" and arguments.results.is_dir()
+        if not may_be_empty and not leaderboard.Store(arguments.results).runs:
             raise ValueError(
                 f"there are no stored runs in {arguments.results}; run this in a clone of the repository, or give --results DIR"
             )

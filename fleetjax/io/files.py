@@ -8,7 +8,7 @@ import os
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 LOCK, PARTIAL = ".lock", ".partial"
 
@@ -116,7 +116,7 @@ def lock(folder: Path) -> Iterator[None]:
             except BlockingIOError:
                 file.seek(0)
                 raise BlockingIOError(f"{folder} is in use by process {file.read().strip() or '(number unknown)'}") from None
-            if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
+            if _is_at(path, file):
                 break  # and not a file that its last owner has removed meanwhile
         file.truncate(0)
         file.write(f"{os.getpid()}\n")
@@ -124,9 +124,16 @@ def lock(folder: Path) -> Iterator[None]:
         try:
             yield
         finally:
-            with contextlib.suppress(FileNotFoundError):
-                if os.path.samestat(os.fstat(file.fileno()), path.stat()):  # and not one that another process has made since
-                    path.unlink()
+            if _is_at(path, file):  # and not one that another process has made since
+                path.unlink(missing_ok=True)
+
+
+def _is_at(path: Path, file: IO[str]) -> bool:
+    """Return whether an open file is still the one at a path."""
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except FileNotFoundError:
+        return False
 
 
 class Log:

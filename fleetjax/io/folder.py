@@ -22,7 +22,7 @@ from flax import serialization
 from fleetjax import envs
 from fleetjax.checks import state_shapes
 from fleetjax.config import Config
-from fleetjax.io import checkpoint, files, interventions, metrics_csv, plain
+from fleetjax.io import checkpoint, files, formats, interventions, metrics_csv, plain
 from fleetjax.io.files import expect
 from fleetjax.learning.imitation import PolicyState
 from fleetjax.metrics import Metrics
@@ -32,7 +32,6 @@ from fleetjax.version import VERSION
 CONFIG, FIGURE, POLICY, EVALUATION = "config.json", "figure.png", "policy.msgpack", "evaluation.json"
 METRICS = metrics_csv.FILE
 RECORD = "console.bin"  # what people did, where they supervised the run
-EXPORTS = ("lerobot", "minari", "robomimic.hdf5")  # where `fleetjax export` puts data sets unless told otherwise
 DATA = (METRICS, POLICY, interventions.FILE, RECORD)
 _OWN_DIGEST = "sha256_config"
 
@@ -92,7 +91,7 @@ def check_folder(path: Path, *, overwrite: bool) -> None:
         raise FileExistsError(f"{path} already exists and is not a run folder; choose another --output")
     if not overwrite:
         raise FileExistsError(f"{path} already exists; choose another --output, or pass --overwrite")
-    for name in EXPORTS:
+    for name in formats.PLACES.values():
         if (path / name).exists():
             raise FileExistsError(f"{path} holds {name}, exported from its run; move or delete it, or choose another --output")
 

@@ -6,6 +6,7 @@ from fleetjax.registry import unknown
 
 NEEDS = {"lerobot": ("pyarrow",), "robomimic": ("h5py",), "minari": ("minari", "gymnasium", "h5py")}
 FORMATS = tuple(NEEDS)
+PLACES = {"lerobot": "lerobot", "robomimic": "robomimic.hdf5", "minari": "minari"}  # in a run folder, unless told otherwise
 
 
 def check(kind: str) -> None:

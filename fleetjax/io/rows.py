@@ -37,18 +37,19 @@ def write(runs: Sequence[Outcome]) -> bytes:
     content = io.StringIO(newline="")
     table = csv.DictWriter(content, _COLUMNS, lineterminator="\n")
     table.writeheader()
-    table.writerows(map(_row, runs))
+    usual = functools.cache(lambda given: to_plain(make_config(**json.loads(given))))  # once for all seeds
+    table.writerows(_row(run, usual) for run in runs)
     return content.getvalue().encode()
 
 
-def _row(run: Outcome) -> dict[str, Any]:
+def _row(run: Outcome, usual: Callable[[str], dict[str, Any]]) -> dict[str, Any]:
     fields, totals = to_plain(run.config), text.add_up(run.metrics)
     own = {name: fields[name] for name in _OWN}
     kept = thinned(len(run.timesteps))
     curves = {name: np.cumsum(getattr(run.metrics, name), dtype=np.int64)[kept].tolist() for name in CURVES}
     return {
         **own,
-        "config": _compact(_differing(run.config, fields, own)),
+        "config": _compact(_differing(run.config, fields, own, usual)),
         **(run.versions or folder.versions()),
         "processor": run.processor or processor(),
         "seed": run.seed,
@@ -62,7 +63,9 @@ def _compact(content: Mapping[str, Any]) -> str:
     return json.dumps(content, separators=(",", ":"))
 
 
-def _differing(config: Config, fields: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+def _differing(
+    config: Config, fields: Mapping[str, Any], own: Mapping[str, Any], usual: Callable[[str], dict[str, Any]]
+) -> dict[str, Any]:
     """Return those `fields` of a configuration that differ from the defaults of a run's environment and algorithm.
 
     Some defaults follow from other fields: what these would change is among them, too.
@@ -70,7 +73,7 @@ def _differing(config: Config, fields: Mapping[str, Any], own: Mapping[str, Any]
     derived = () if config.capacity_given else ("human_capacity",)
     kept: dict[str, Any] = {}
     for _ in range(2):
-        again = to_plain(make_config(**own, **kept))
+        again = usual(_compact({**own, **kept}))
         kept |= {name: value for name, value in fields.items() if value != again[name] and name not in derived}
     return kept
 

@@ -63,7 +63,7 @@ def _check_shared(path: Path) -> None:
     Raises:
         Refusal: if one does not.
     """
-    mark = path / f".seen-{team.led(lambda: _leave_mark(path))}"
+    mark = path / team.led(lambda: _leave_mark(path))
     until = time.monotonic() + PATIENCE
     while not (seen := mark.exists()) and time.monotonic() < until:  # NFS shows new files late
         time.sleep(0.1)
@@ -78,9 +78,9 @@ def _check_shared(path: Path) -> None:
 
 
 def _leave_mark(path: Path) -> str:
-    token = uuid.uuid4().hex
-    (path / f".seen-{token}").touch()
-    return token
+    name = f".seen-{uuid.uuid4().hex}"
+    (path / name).touch()
+    return name
 
 
 def _lock(path: Path, stack: contextlib.ExitStack) -> None:

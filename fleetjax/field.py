@@ -64,7 +64,7 @@ class Fields:
     """The parameters that every run has. Static ones shape the program, traced ones are arrays."""
 
     environment: str = _static("humanoid", "name of the environment")
-    algorithm: str = _static("cur", "name of the algorithm, or an order of the letters c, u, r")
+    algorithm: str = _static("cur", "name of the algorithm, an order of the letters c, u, r, or MODULE:NAME")
     supervisor: str = _static("", "name of the supervisor; empty = the environment's own")
     backend: str = _static("auto", "physics backend: native (CPU threads), mjx (pure JAX), warp (NVIDIA GPU), auto")
     allocation: str = _static("hard", "hard, or soft: relaxed for derivatives (algorithms with differentiable scores)")

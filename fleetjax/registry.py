@@ -1,6 +1,11 @@
-"""Names that users choose by: environments, algorithms, supervisors and estimators are each in a registry."""
+"""Names that users choose by: environments, algorithms, supervisors and estimators are each in a registry.
+
+A name may have the form `MODULE:NAME`, as in Gymnasium: the module is imported, and registers NAME.
+"""
 
 import difflib
+import importlib
+import re
 from collections.abc import Iterable, Iterator
 from typing import Generic, TypeVar
 
@@ -37,14 +42,15 @@ class Registry(Generic[Entry]):
         self.entries[name] = entry
 
     def get(self, name: str) -> Entry:
-        """Return an entry.
+        """Return an entry, after the import of the module in `MODULE:NAME`.
 
         Raises:
-            ValueError: if there is none of that name; the message has the closest ones.
+            ValueError: if there is none of that name; the message has the closest ones. Or if the module cannot be imported.
         """
-        if not isinstance(name, str) or name not in self.entries:
+        own = load(name)
+        if own not in self.entries:
             raise ValueError(unknown(self.kind, name, self.entries))
-        return self.entries[name]
+        return self.entries[own]
 
     def names(self) -> tuple[str, ...]:
         """Return the names, in the order of registration."""
@@ -55,6 +61,25 @@ class Registry(Generic[Entry]):
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.entries)
+
+
+def load(name: object) -> str:
+    """Import the module in a name of the form `MODULE:NAME`, and return NAME; return other names as they are.
+
+    Raises:
+        ValueError: if the module cannot be imported.
+    """
+    module, colon, own = str(name).rpartition(":")
+    if not colon:
+        return own
+    try:
+        if not re.fullmatch(r"\w+(\.\w+)*", module):
+            raise ImportError(f"{module!r} is not the name of a module")
+        importlib.import_module(module)
+    except Exception as error:  # whatever the module does
+        reason = f"{type(error).__name__}: {error}"
+        raise ValueError(f"{name}: its module cannot be imported: {reason}; is its folder on PYTHONPATH?") from error
+    return own
 
 
 def unknown(kind: str, name: object, known: Iterable[str]) -> str:

@@ -190,7 +190,7 @@ def calibrate_field(arguments: argparse.Namespace) -> None:
             tuple(range(arguments.first_seed, arguments.first_seed + arguments.seeds)),
             arguments.tolerance,
             arguments.most,
-            arguments.output or Path("runs") / f"calibrate-{config.environment}-{config.algorithm}",
+            arguments.output or Path("runs") / text.as_path(f"calibrate-{config.environment}-{config.algorithm}"),
             arguments.checkpoint_every,
         )
         calibration.check(request)
@@ -409,8 +409,10 @@ def lead(arguments: argparse.Namespace) -> None:
     from fleetjax.io import leaderboard, standings
 
     with _refusing():
+        removed = arguments.algorithms if arguments.action == "remove" else ()
+        stored = leaderboard.Store(arguments.results, without=removed)
         may_be_empty = arguments.action == "add" and arguments.results.is_dir()
-        if not may_be_empty and not leaderboard.Store(arguments.results).runs:
+        if not (may_be_empty or stored.places or stored.runs):
             raise ValueError(
                 f"there are no stored runs in {arguments.results}; run this in a clone of the repository, or give --results DIR"
             )
@@ -419,7 +421,7 @@ def lead(arguments: argparse.Namespace) -> None:
             asked = (arguments.environments, arguments.budgets, arguments.seeds, arguments.output)
             entries = leaderboard.entries(arguments.algorithms, *asked)
         with files.lock(arguments.results):
-            store = leaderboard.Store(arguments.results)
+            store = leaderboard.Store(arguments.results, without=removed)
             if arguments.action == "remove":
                 store.remove(arguments.algorithms)
                 say("their run folders remain: before you add a changed rule, delete them or choose another --output")

@@ -12,7 +12,7 @@ from fleetjax.io.errors import Refusal
 from fleetjax.io.formats import FORMATS
 from fleetjax.io.lists import listed
 from fleetjax.io.parameters import IN_CONSOLE, add_parameters, integer, number, seed
-from fleetjax.registry import unknown
+from fleetjax.registry import load, unknown
 from fleetjax.version import VERSION
 
 LAUNCHERS = ("local", "slurm")
@@ -107,10 +107,27 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         SystemExit: with code 0, after help or version.
     """
     environment = next((word for word in argv[1:] if word in list_envs()), None)
+    _import_algorithms(argv)
     parser, commands = make_parser(environment)
     if argv and not argv[0].startswith("-") and argv[0] not in commands:
         raise Refusal(unknown("command", argv[0], commands))
     return parser.parse_args(argv or ["--help"])
+
+
+def _import_algorithms(argv: Sequence[str]) -> None:
+    """Import the modules of algorithms such as `my_rules:mine`, whose parameters have flags, too.
+
+    Raises:
+        Refusal: if a module cannot be imported.
+    """
+    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    early.add_argument("--algorithm", action="append", nargs="?", default=[])
+    for names in early.parse_known_args(argv)[0].algorithm:
+        for name in (names or "").split(","):
+            try:
+                load(name)
+            except ValueError as error:
+                raise Refusal(str(error)) from None
 
 
 def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser, list[str]]:
@@ -187,7 +204,7 @@ def _add_leaderboard(commands: Any) -> None:
     add = actions.add_parser("add", help="run rules and store their runs, then show")
     remove = actions.add_parser("remove", help="forget the stored runs of rules, then show")
     for one in (add, remove):
-        one.add_argument("algorithms", metavar="RULE", nargs="+", help="registered algorithm")
+        one.add_argument("algorithms", metavar="RULE", nargs="+", help="registered algorithm, or MODULE:NAME")
     where = "environments, separated by commas [default: navigation,block_push]"
     add.add_argument("--environments", metavar="ENV,...", type=listed(str), default=["navigation", "block_push"], help=where)
     much = "human timesteps, separated by commas [default: those of the environment]"

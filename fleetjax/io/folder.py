@@ -8,7 +8,6 @@ import contextlib
 import csv
 import itertools
 import json
-import re
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -22,7 +21,7 @@ from flax import serialization
 from fleetjax import envs
 from fleetjax.checks import state_shapes
 from fleetjax.config import Config
-from fleetjax.io import checkpoint, files, formats, interventions, metrics_csv, plain
+from fleetjax.io import checkpoint, files, formats, interventions, metrics_csv, plain, text
 from fleetjax.io.files import expect
 from fleetjax.learning.imitation import PolicyState
 from fleetjax.metrics import Metrics
@@ -59,7 +58,7 @@ class Run(NamedTuple):
 def default_folder(config: Config, seed: int) -> Path:
     """Return a folder below `runs/` that does not exist yet."""
     name = f"{config.environment}-{config.algorithm}-seed{seed}-{time.strftime('%Y%m%d-%H%M%S')}"
-    path = Path("runs") / re.sub(r"[^\w.-]", "_", name)
+    path = Path("runs") / text.as_path(name)
     others = (path.with_name(f"{path.name}-{i}") for i in itertools.count(2))
     return next(p for p in itertools.chain([path], others) if not p.exists())
 

@@ -10,7 +10,7 @@ initial period; elsewhere no rule has one. Extra demonstrations count as human t
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -83,7 +83,7 @@ class Entry(NamedTuple):
     @property
     def folder(self) -> Path:
         """The folder of its run folders."""
-        return self.output / self.environment / self.algorithm
+        return self.output / self.environment / text.as_path(self.algorithm)
 
     @property
     def requests(self) -> dict[float | None, calibration.Request]:
@@ -135,19 +135,20 @@ class Store:
 
     Args:
         results: their folder.
+        without: rules whose rows are not read; they need not be registered.
 
     Raises:
         ValueError: if one of the files is damaged.
     """
 
-    def __init__(self, results: Path):
+    def __init__(self, results: Path, without: Collection[str] = ()):
         self.table, self.rows = results / "leaderboard.json", results / "leaderboard.csv"
         try:
             known = json.loads(self.table.read_text())["calibrations"] if self.table.exists() else []
             self.places = [Place(**one) for one in known]
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{self.table} cannot be used: {files.one_line(error)}; restore it") from None
-        self.runs: list[Outcome] = rows.read(self.rows) if self.rows.exists() else []
+        self.runs: list[Outcome] = rows.read(self.rows, without) if self.rows.exists() else []
 
     def find(self, environment: str, algorithm: str, budget: int) -> Place | None:
         """Return a stored calibration, or None."""

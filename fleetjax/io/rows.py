@@ -6,23 +6,23 @@ import functools
 import io
 import json
 import platform
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fleetjax.config import Config, make_config
+from fleetjax.config import Config, all_fields, make_config
 from fleetjax.io import folder, text
 from fleetjax.io.files import expect
 from fleetjax.io.metrics_csv import REALS
 from fleetjax.io.outcomes import Outcome, thinned
-from fleetjax.io.plain import to_plain
+from fleetjax.io.plain import LATER, from_plain, to_plain
 from fleetjax.metrics import Metrics
 
 SUFFIX = ".csv"
 CURVES = ("successes", "violations", "idle", "human_steps")  # that a row holds over time; of other metrics it has the total
-# Fields that have columns of their own: numbers depend on them, so they must not change with the defaults.
+# Fields that have columns of their own; `config` holds the others, so that no row changes with the defaults.
 _OWN = ("environment", "algorithm", "num_robots", "num_humans", "num_steps", "extra_demonstrations")
 _VERSIONS = ("fleetjax", "jax", "mujoco")
 _NOTES = ("processor", "seed", "timesteps")
@@ -37,19 +37,18 @@ def write(runs: Sequence[Outcome]) -> bytes:
     content = io.StringIO(newline="")
     table = csv.DictWriter(content, _COLUMNS, lineterminator="\n")
     table.writeheader()
-    usual = functools.cache(lambda given: to_plain(make_config(**json.loads(given))))  # once for all seeds
-    table.writerows(_row(run, usual) for run in runs)
+    table.writerows(map(_row, runs))
     return content.getvalue().encode()
 
 
-def _row(run: Outcome, usual: Callable[[str], dict[str, Any]]) -> dict[str, Any]:
+def _row(run: Outcome) -> dict[str, Any]:
     fields, totals = to_plain(run.config), text.add_up(run.metrics)
-    own = {name: fields[name] for name in _OWN}
+    own = {name: fields.pop(name) for name in _OWN}
     kept = thinned(len(run.timesteps))
     curves = {name: np.cumsum(getattr(run.metrics, name), dtype=np.int64)[kept].tolist() for name in CURVES}
     return {
         **own,
-        "config": _compact(_differing(run.config, fields, own, usual)),
+        "config": _compact(fields),
         **(run.versions or folder.versions()),
         "processor": run.processor or processor(),
         "seed": run.seed,
@@ -63,21 +62,6 @@ def _compact(content: Mapping[str, Any]) -> str:
     return json.dumps(content, separators=(",", ":"))
 
 
-def _differing(
-    config: Config, fields: Mapping[str, Any], own: Mapping[str, Any], usual: Callable[[str], dict[str, Any]]
-) -> dict[str, Any]:
-    """Return those `fields` of a configuration that differ from the defaults of a run's environment and algorithm.
-
-    Some defaults follow from other fields: what these would change is among them, too.
-    """
-    derived = () if config.capacity_given else ("human_capacity",)
-    kept: dict[str, Any] = {}
-    for _ in range(2):
-        again = usual(_compact({**own, **kept}))
-        kept |= {name: value for name, value in fields.items() if value != again[name] and name not in derived}
-    return kept
-
-
 def processor() -> str:
     """Return the name of this machine's processor."""
     with contextlib.suppress(OSError):
@@ -87,8 +71,12 @@ def processor() -> str:
     return platform.processor() or platform.machine()
 
 
-def read(path: Path) -> list[Outcome]:
+def read(path: Path, without: Collection[str] = ()) -> list[Outcome]:
     """Read a file of rows.
+
+    Args:
+        path: the file.
+        without: algorithms whose rows are skipped; they need not be registered.
 
     Raises:
         ValueError: if it is missing or damaged; the message has the path, the row and the reason.
@@ -99,17 +87,27 @@ def read(path: Path) -> list[Outcome]:
         raise ValueError(f"{path} cannot be read: {error}") from None
     table = csv.DictReader(io.StringIO(content, newline=""), strict=True)
     runs: list[Outcome] = []
-    make = functools.cache(lambda fields: make_config(**json.loads(fields)))  # once for all seeds
+    make = functools.cache(_config)  # once for all seeds
+    number = 1  # of the next row
     missing = set(_COLUMNS) - set(Metrics._fields) - set(table.fieldnames or ())
     expect(not missing, f"{path} is not a file of rows: it has no columns {', '.join(sorted(missing))}")
     try:
         for row in table:
             expect(None not in row and None not in row.values(), "its number of cells is not that of the columns")
-            runs.append(_outcome(row, make, f"{path}, row {len(runs) + 1}"))
+            if row["algorithm"] not in without:
+                runs.append(_outcome(row, make, f"{path}, row {number}"))
+            number += 1
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError, csv.Error) as error:
-        raise ValueError(f"{path} cannot be used: row {len(runs) + 1}: {error}") from None
-    expect(bool(runs), f"{path} has no rows")
+        raise ValueError(f"{path} cannot be used: row {number}: {error}") from None
+    expect(number > 1, f"{path} has no rows")
     return runs
+
+
+def _config(given: str) -> Config:
+    """Return the configuration of a row. Rows of older versions have only what differs from the defaults."""
+    fields = json.loads(given)
+    missing = all_fields(fields["algorithm"]).keys() - fields.keys()
+    return make_config(**fields) if missing - LATER else from_plain(fields)
 
 
 def _outcome(row: Mapping[str, str], make: Callable[[str], Config], name: str) -> Outcome:

@@ -6,7 +6,6 @@ A sweep has one or more blocks. A block holds a list of values for each of its n
 import collections
 import contextlib
 import itertools
-import re
 import tomllib
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,11 +18,11 @@ from fleetjax.checks import check_plan
 from fleetjax.config import Config, all_fields, make_config
 from fleetjax.envs import list_envs
 from fleetjax.field import every_field, owners
-from fleetjax.io import folder, plain
+from fleetjax.io import folder, plain, text
 from fleetjax.io.files import expect
 from fleetjax.io.flags import LAUNCHERS
 from fleetjax.io.parameters import LARGEST_SEED
-from fleetjax.registry import unknown
+from fleetjax.registry import load, unknown
 
 Block = Mapping[str, list[Any]]
 Group = tuple[folder.Run, ...]  # completed together by one process
@@ -187,6 +186,9 @@ def _read(path: Path) -> tuple[dict[str, Any], Block, list[Block]]:
         content = {name.replace("-", "_"): value for name, value in tomllib.loads(path.read_text()).items()}
         parts = content.pop("runs", [{}])
         expect(isinstance(parts, list) and all(isinstance(part, dict) for part in parts), "runs must be [[runs]] blocks")
+        for part in (content, *parts):
+            for name in _as_list("algorithm", part.get("algorithm", [])):
+                load(name)  # its parameters may be in the file, too
         options = {name: content.pop(name) for name in _OPTIONS if name in content}
         for name, value in options.items():
             expect(type(value) is _OPTIONS[name], f"{name} = {value!r} must be of type {_OPTIONS[name].__name__}")
@@ -333,8 +335,7 @@ def _name(run: _Planned, varied: Sequence[str]) -> str:
     """Return the name of a run's folder: `navigation-cur-num_humans=5-seed0`."""
     values = plain.to_plain(run.config)
     parts = [f"{name}={_written(values[name])}" for name in varied if name in run.given]
-    name = "-".join([run.config.environment, run.config.algorithm, *parts, f"seed{run.seed}"])
-    return re.sub(r"[^\w.=+-]", "_", name)
+    return text.as_path("-".join([run.config.environment, run.config.algorithm, *parts, f"seed{run.seed}"]))
 
 
 def _written(value: Any) -> str:

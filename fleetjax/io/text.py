@@ -1,5 +1,6 @@
 """Numbers, names and tables as people read them."""
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
@@ -72,6 +73,15 @@ def label(algorithm: str) -> str:
     if algorithm in _KNOWN:
         return _KNOWN[algorithm][0]
     return "".join(f"{letter.upper()}." for letter in algorithm) if is_order(algorithm) else algorithm
+
+
+def as_path(name: str) -> str:
+    """Return a name as it stands in the name of a file or folder.
+
+    >>> as_path("navigation-my_rules:mine-num_humans=5")
+    'navigation-my_rules_mine-num_humans=5'
+    """
+    return re.sub(r"[^\w.=+-]", "_", name)
 
 
 def meaning(algorithm: str) -> str:

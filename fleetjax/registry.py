@@ -57,7 +57,10 @@ class Registry(Generic[Entry]):
         return tuple(self.entries)
 
     def __contains__(self, name: object) -> bool:
-        return name in self.entries
+        try:
+            return load(name) in self.entries
+        except ValueError:
+            return False
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.entries)

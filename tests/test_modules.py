@@ -28,7 +28,8 @@ fleetjax.register_priority("mine", make_mine, estimators=(), parameters={"zeal_r
 WORLD = """
 import fleetjax
 from fleetjax.envs import navigation
-fleetjax.register_env("world", lambda backend: navigation.make_env(), defaults={"num_robots": 3, "num_humans": 1})
+DEFAULTS = {"num_robots": 3, "num_humans": 1, "random_threshold": 0.7}
+fleetjax.register_env("world", lambda backend: navigation.make_env(), defaults=DEFAULTS)
 """
 _numbers = itertools.count()
 
@@ -88,8 +89,8 @@ def test_sweeps_take_parameters_of_a_module(module, tmp_path):
 
 
 def test_an_environment_of_a_module_has_its_defaults(module):
-    config = fleetjax.make_config(f"{module(WORLD)}:world")
-    assert (config.num_robots, config.num_humans) == (3, 1)
+    config = fleetjax.make_config(f"{module(WORLD)}:world", "random")
+    assert (config.num_robots, config.num_humans, config.parameters["random_threshold"]) == (3, 1, np.float32(0.7))
     assert envs.make(config.environment, "auto").spec.name == "navigation"
 
 

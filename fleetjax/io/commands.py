@@ -14,7 +14,7 @@ from fleetjax import envs, sharding
 from fleetjax.checks import check_mesh, check_run
 from fleetjax.config import Config, make_config
 from fleetjax.console.controls import CONTROLS, check_people
-from fleetjax.envs import get_defaults, list_envs
+from fleetjax.envs import ENVIRONMENTS, get_defaults, list_envs
 from fleetjax.field import FIELDS, every_field, owners_in_words
 from fleetjax.io import (
     calibration,
@@ -329,7 +329,7 @@ def render_robots(arguments: argparse.Namespace) -> None:
             if getattr(arguments, name) < low:
                 raise ValueError(f"{name} = {getattr(arguments, name)} must be at least {low}")
         render.check_format(arguments.output)
-        run = None if arguments.source in list_envs() else folder.read_run(path)
+        run = None if arguments.source in ENVIRONMENTS else folder.read_run(path)
         who = arguments.policy or ("robot" if run else "expert")
         if who == "robot" and run is None:
             raise ValueError(f"--policy robot needs a run folder, but {arguments.source} is an environment")

@@ -40,15 +40,14 @@ def main() -> None:
     args = parser.parse_args()
     args.results.mkdir(parents=True, exist_ok=True)
     with files.lock(args.results):
-        store = leaderboard.Store(args.results)
-        if not args.rows_only:
-            asked = (args.environments, args.budgets or (), args.seeds, args.output)
-            try:
-                entries = leaderboard.entries(args.algorithms or ORDER, *asked)
-            except ValueError as error:
-                parser.error(str(error))
-            for entry in entries:
-                leaderboard.compete(store, entry)
+        asked = (args.environments, args.budgets or (), args.seeds, args.output)
+        try:
+            store = leaderboard.Store(args.results)
+            entries = [] if args.rows_only else leaderboard.entries(args.algorithms or ORDER, *asked)
+        except ValueError as error:
+            parser.error(str(error))
+        for entry in entries:
+            leaderboard.compete(store, entry)
         if store.runs:
             print(standings.publish(store))
 

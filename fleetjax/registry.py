@@ -1,11 +1,6 @@
-"""Names that users choose by: environments, algorithms, supervisors and estimators are each in a registry.
-
-A name may have the form `MODULE:NAME`, as in Gymnasium: the module is imported, and registers NAME.
-"""
+"""Names that users choose by: environments, algorithms, supervisors and estimators are each in a registry."""
 
 import difflib
-import importlib
-import re
 from collections.abc import Iterable, Iterator
 from typing import Generic, TypeVar
 
@@ -42,47 +37,24 @@ class Registry(Generic[Entry]):
         self.entries[name] = entry
 
     def get(self, name: str) -> Entry:
-        """Return an entry, after the import of the module in `MODULE:NAME`.
+        """Return an entry.
 
         Raises:
-            ValueError: if there is none of that name; the message has the closest ones. Or if the module cannot be imported.
+            ValueError: if there is none of that name; the message has the closest ones.
         """
-        own = load(name)
-        if own not in self.entries:
+        if not isinstance(name, str) or name not in self.entries:
             raise ValueError(unknown(self.kind, name, self.entries))
-        return self.entries[own]
+        return self.entries[name]
 
     def names(self) -> tuple[str, ...]:
         """Return the names, in the order of registration."""
         return tuple(self.entries)
 
     def __contains__(self, name: object) -> bool:
-        try:
-            return load(name) in self.entries
-        except ValueError:
-            return False
+        return name in self.entries
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.entries)
-
-
-def load(name: object) -> str:
-    """Import the module in a name of the form `MODULE:NAME`, and return NAME; return other names as they are.
-
-    Raises:
-        ValueError: if the module cannot be imported.
-    """
-    module, colon, own = str(name).rpartition(":")
-    if not colon:
-        return own
-    try:
-        if not re.fullmatch(r"\w+(\.\w+)*", module):
-            raise ImportError(f"{module!r} is not the name of a module")
-        importlib.import_module(module)
-    except Exception as error:  # whatever the module does
-        reason = f"{type(error).__name__}: {error}"
-        raise ValueError(f"{name}: its module cannot be imported: {reason}; is its folder on PYTHONPATH?") from error
-    return own
 
 
 def unknown(kind: str, name: object, known: Iterable[str]) -> str:

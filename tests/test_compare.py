@@ -321,15 +321,6 @@ def test_rows_do_not_change_with_the_defaults(tmp_path, monkeypatch):
     assert plain.to_plain(rows.read(path)[0].config) == plain.to_plain(config)
 
 
-def test_rows_of_older_versions_have_only_what_differs_from_the_defaults(tmp_path):
-    config, path = fleetjax.make_config("navigation", "random", random_threshold=0.25), tmp_path / "rows.csv"
-    path.write_bytes(rows.write(sources.collect([(config, 0, make_metrics(0, config.num_steps))])))
-    table = pd.read_csv(path)
-    table["config"] = '{"random_threshold":0.25}'
-    table.to_csv(path, index=False)
-    assert plain.to_plain(rows.read(path)[0].config) == plain.to_plain(config)
-
-
 def test_a_file_that_is_named_twice_is_refused(study, tmp_path, capsys):
     path = tmp_path / "table.csv"
     assert "is named twice" in refused(capsys, "compare", study, "--output", path, "--rows", path)
@@ -377,7 +368,8 @@ def test_damaged_rows_are_refused(study, tmp_path, capsys):
         '""human_steps"":[': ('""human_steps"":[9999,', "row 1: the curve of human_steps does not rise to its total"),
         "navigation,": ("navigatoin,", "row 1: environment = 'navigatoin' is unknown"),
         f",{STEPS},": (",many,", "row 1: invalid literal"),
-        '""batch_size"":': ('""batch_sizes"":', "row 1: config field = 'batch_sizes' is unknown"),
+        '""batch_size"":': ('""batch_sizes"":', "row 1: unknown fields: batch_sizes"),
+        '""batch_size"":128,': ("", "row 1: missing fields: batch_size (another version of fleetjax?)"),
         '"{""supervisor""': ('"{""num_robot"":3,""supervisor""', "row 1: unknown fields: num_robot"),
     }  # fmt: skip
     for i, (old, (new, reason)) in enumerate(spoilt.items()):

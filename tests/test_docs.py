@@ -114,8 +114,10 @@ def test_examples_in_docstrings():
     assert not any(result.failed for result in results)
 
 
-def test_commands_can_be_typed(monkeypatch):
-    monkeypatch.setitem(sys.modules, "my_rules", types.ModuleType("my_rules"))
+def test_commands_can_be_typed(monkeypatch, own_registries):
+    rules = types.ModuleType("my_rules")
+    rules.surprise = fleetjax.Algorithm(lambda config: None)
+    monkeypatch.setitem(sys.modules, "my_rules", rules)
     typed = {command for text in TEXTS.values() for command in commands(text)}
     assert len(typed) > 15
     for command in typed:

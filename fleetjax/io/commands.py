@@ -14,7 +14,7 @@ from fleetjax import envs, sharding
 from fleetjax.checks import check_mesh, check_run
 from fleetjax.config import Config, make_config
 from fleetjax.console.controls import CONTROLS, check_people
-from fleetjax.envs import ENVIRONMENTS, get_defaults, list_envs
+from fleetjax.envs import get_defaults, list_envs
 from fleetjax.field import FIELDS, every_field, owners_in_words
 from fleetjax.io import (
     calibration,
@@ -329,7 +329,7 @@ def render_robots(arguments: argparse.Namespace) -> None:
             if getattr(arguments, name) < low:
                 raise ValueError(f"{name} = {getattr(arguments, name)} must be at least {low}")
         render.check_format(arguments.output)
-        run = None if arguments.source in ENVIRONMENTS else folder.read_run(path)
+        run = None if arguments.source in list_envs() else folder.read_run(path)
         who = arguments.policy or ("robot" if run else "expert")
         if who == "robot" and run is None:
             raise ValueError(f"--policy robot needs a run folder, but {arguments.source} is an environment")
@@ -409,10 +409,8 @@ def lead(arguments: argparse.Namespace) -> None:
     from fleetjax.io import leaderboard, standings
 
     with _refusing():
-        removed = arguments.algorithms if arguments.action == "remove" else ()
-        stored = leaderboard.Store(arguments.results, without=removed)
         may_be_empty = arguments.action == "add" and arguments.results.is_dir()
-        if not (may_be_empty or stored.places or stored.runs):
+        if not (may_be_empty or leaderboard.is_stored(arguments.results)):
             raise ValueError(
                 f"there are no stored runs in {arguments.results}; run this in a clone of the repository, or give --results DIR"
             )
@@ -421,10 +419,10 @@ def lead(arguments: argparse.Namespace) -> None:
             asked = (arguments.environments, arguments.budgets, arguments.seeds, arguments.output)
             entries = leaderboard.entries(arguments.algorithms, *asked)
         with files.lock(arguments.results):
-            store = leaderboard.Store(arguments.results, without=removed)
             if arguments.action == "remove":
-                store.remove(arguments.algorithms)
+                leaderboard.remove(arguments.results, arguments.algorithms)
                 say("their run folders remain: before you add a changed rule, delete them or choose another --output")
+            store = leaderboard.Store(arguments.results)
             for entry in entries:
                 leaderboard.compete(store, entry)
             page = standings.publish(store)

@@ -12,7 +12,7 @@ from fleetjax.io.errors import Refusal
 from fleetjax.io.formats import FORMATS
 from fleetjax.io.lists import listed
 from fleetjax.io.parameters import IN_CONSOLE, add_parameters, integer, number, seed
-from fleetjax.registry import load, unknown
+from fleetjax.registry import unknown
 from fleetjax.version import VERSION
 
 LAUNCHERS = ("local", "slurm")
@@ -115,7 +115,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
 
 
 def _import_algorithms(argv: Sequence[str]) -> None:
-    """Import the modules of algorithms such as `my_rules:mine`, whose parameters have flags, too.
+    """Import algorithms such as `my_rules:mine`, whose parameters have flags, too.
 
     Raises:
         Refusal: if a module cannot be imported.
@@ -124,10 +124,13 @@ def _import_algorithms(argv: Sequence[str]) -> None:
     early.add_argument("--algorithm", action="append", nargs="?", default=[])
     for names in early.parse_known_args(argv)[0].algorithm:
         for name in (names or "").split(","):
-            try:
-                load(name)
-            except ValueError as error:
-                raise Refusal(str(error)) from None
+            if ":" in name:
+                from fleetjax.priority import get_algorithm  # on demand: it loads JAX
+
+                try:
+                    get_algorithm(name.strip())
+                except ValueError as error:
+                    raise Refusal(str(error)) from None
 
 
 def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser, list[str]]:

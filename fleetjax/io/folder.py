@@ -1,7 +1,8 @@
 """The folder of a run: configuration, per-timestep metrics, figure and trained policy.
 
 `config.json` is written when a run starts, and again at the end, with the SHA-256 digests of the data files. It always holds
-the digest of its own content. What does not match is refused. Nothing that is read is executed.
+the digest of its own content. What does not match is refused. Nothing that is read is executed; but the module of an
+algorithm such as `my_rules:mine` is imported.
 """
 
 import contextlib

@@ -10,7 +10,7 @@ initial period; elsewhere no rule has one. Extra demonstrations count as human t
 """
 
 import json
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -135,20 +135,15 @@ class Store:
 
     Args:
         results: their folder.
-        without: rules whose rows are not read; they need not be registered.
 
     Raises:
         ValueError: if one of the files is damaged.
     """
 
-    def __init__(self, results: Path, without: Collection[str] = ()):
-        self.table, self.rows = results / "leaderboard.json", results / "leaderboard.csv"
-        try:
-            known = json.loads(self.table.read_text())["calibrations"] if self.table.exists() else []
-            self.places = [Place(**one) for one in known]
-        except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{self.table} cannot be used: {files.one_line(error)}; restore it") from None
-        self.runs: list[Outcome] = rows.read(self.rows, without) if self.rows.exists() else []
+    def __init__(self, results: Path):
+        self.table, self.rows = _files(results)
+        self.places = _read_places(self.table)
+        self.runs: list[Outcome] = rows.read(self.rows) if self.rows.exists() else []
 
     def find(self, environment: str, algorithm: str, budget: int) -> Place | None:
         """Return a stored calibration, or None."""
@@ -159,28 +154,9 @@ class Store:
         """Store a calibration, and runs that were not stored."""
         self.places = [*(other for other in self.places if other[:3] != place[:3]), place]
         self.runs += found
-        self._write()
-
-    def remove(self, algorithms: Sequence[str]) -> None:
-        """Forget all that is stored of these rules.
-
-        Raises:
-            ValueError: if nothing is stored of one of them.
-        """
-        known = dict.fromkeys(place.algorithm for place in self.places)
-        for algorithm in algorithms:
-            if algorithm not in known:
-                raise ValueError(f"nothing is stored of {algorithm!r}; there is {', '.join(known) or 'no rule'}")
-        self.places = [place for place in self.places if place.algorithm not in algorithms]
-        self.runs = [run for run in self.runs if run.config.algorithm not in algorithms]
-        self._write()
-
-    def _write(self) -> None:
         if self.runs:
             files.write(self.rows, rows.write(self.runs))
-        else:
-            self.rows.unlink(missing_ok=True)
-        files.write_json(self.table, {"calibrations": [one._asdict() for one in self.places]})
+        _write_places(self.table, self.places)
 
     def group_of(self, place: Place) -> Group | None:
         """Return the runs at a calibrated value, as one group."""
@@ -191,6 +167,43 @@ class Store:
             if all(np.float32(get_value(run.config, name)) == np.float32(value) for name, value in place.settings.items())
         ]
         return group(same)[-1] if same else None  # of different settings, the newest
+
+
+def _files(results: Path) -> tuple[Path, Path]:
+    return results / "leaderboard.json", results / "leaderboard.csv"
+
+
+def _read_places(table: Path) -> list[Place]:
+    try:
+        known = json.loads(table.read_text())["calibrations"] if table.exists() else []
+        return [Place(**one) for one in known]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{table} cannot be used: {files.one_line(error)}; restore it") from None
+
+
+def _write_places(table: Path, places: Sequence[Place]) -> None:
+    files.write_json(table, {"calibrations": [one._asdict() for one in places]})
+
+
+def is_stored(results: Path) -> bool:
+    """Return whether a folder holds rows of a leaderboard."""
+    return _files(results)[1].exists()
+
+
+def remove(results: Path, algorithms: Sequence[str]) -> None:
+    """Forget all that is stored of these rules; they need not be registered any more.
+
+    Raises:
+        ValueError: if nothing is stored of one of them, or one of the files is damaged.
+    """
+    table, runs = _files(results)
+    places = _read_places(table)
+    known = dict.fromkeys(place.algorithm for place in places)
+    for algorithm in algorithms:
+        if algorithm not in known:
+            raise ValueError(f"nothing is stored of {algorithm!r}; there is {', '.join(known) or 'no rule'}")
+    rows.drop(runs, algorithms)
+    _write_places(table, [place for place in places if place.algorithm not in algorithms])
 
 
 def entries(

@@ -11,7 +11,7 @@ from fleetjax.field import KINDS, OF_HUMANS, OF_LINKS, Field
 from fleetjax.io.files import expect
 
 # Fields that came later; their defaults are what was done before.
-LATER = {"allocation", "temperature", "human_model", "link_model", *OF_HUMANS, *OF_LINKS}
+_LATER = ("allocation", "temperature", "human_model", "link_model", *OF_HUMANS, *OF_LINKS)
 _LARGEST = 2**31 - 1  # traced integers are i32
 
 
@@ -35,7 +35,7 @@ def from_plain(fields: Mapping[str, Any]) -> Config:
         ValueError: if they are not those of a configuration.
     """
     known = all_fields(fields.get("algorithm", ""))
-    fields = {name: known[name].default for name in LATER if name in known} | dict(fields)
+    fields = {name: known[name].default for name in _LATER if name in known} | dict(fields)
     for problem, names in (("unknown", set(fields) - set(known)), ("missing", set(known) - set(fields))):
         expect(not names, f"{problem} fields: {', '.join(sorted(names))} (another version of fleetjax?)")
     for name, value in fields.items():

@@ -6,18 +6,18 @@ import functools
 import io
 import json
 import platform
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fleetjax.config import Config, all_fields, make_config
-from fleetjax.io import folder, text
+from fleetjax.config import Config
+from fleetjax.io import files, folder, text
 from fleetjax.io.files import expect
 from fleetjax.io.metrics_csv import REALS
 from fleetjax.io.outcomes import Outcome, thinned
-from fleetjax.io.plain import LATER, from_plain, to_plain
+from fleetjax.io.plain import from_plain, to_plain
 from fleetjax.metrics import Metrics
 
 SUFFIX = ".csv"
@@ -34,11 +34,7 @@ def write(runs: Sequence[Outcome]) -> bytes:
 
     Runs whose processor is not known count as runs of this machine.
     """
-    content = io.StringIO(newline="")
-    table = csv.DictWriter(content, _COLUMNS, lineterminator="\n")
-    table.writeheader()
-    table.writerows(map(_row, runs))
-    return content.getvalue().encode()
+    return _written(map(_row, runs), _COLUMNS)
 
 
 def _row(run: Outcome) -> dict[str, Any]:
@@ -71,43 +67,59 @@ def processor() -> str:
     return platform.processor() or platform.machine()
 
 
-def read(path: Path, without: Collection[str] = ()) -> list[Outcome]:
+def read(path: Path) -> list[Outcome]:
     """Read a file of rows.
-
-    Args:
-        path: the file.
-        without: algorithms whose rows are skipped; they need not be registered.
 
     Raises:
         ValueError: if it is missing or damaged; the message has the path, the row and the reason.
     """
+    runs: list[Outcome] = []
+    make = functools.cache(lambda fields: from_plain(json.loads(fields)))  # once for all seeds
+    table = _table(path)
+    try:
+        for row in table:
+            expect(None not in row and None not in row.values(), "its number of cells is not that of the columns")
+            runs.append(_outcome(row, make, f"{path}, row {len(runs) + 1}"))
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError, csv.Error) as error:
+        raise ValueError(f"{path} cannot be used: row {len(runs) + 1}: {error}") from None
+    expect(bool(runs), f"{path} has no rows")
+    return runs
+
+
+def drop(path: Path, algorithms: Collection[str]) -> None:
+    """Remove the rows of algorithms from a file, or the file if it has no others. The algorithms need not be registered.
+
+    Raises:
+        ValueError: if the file is missing or damaged.
+    """
+    table = _table(path)
+    try:
+        kept = [row for row in table if row["algorithm"] not in algorithms]
+    except csv.Error as error:
+        raise ValueError(f"{path} cannot be used: {error}") from None
+    if kept:
+        files.write(path, _written(kept, table.fieldnames or ()))
+    else:
+        path.unlink()
+
+
+def _written(table: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> bytes:
+    content = io.StringIO(newline="")
+    writer = csv.DictWriter(content, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(table)
+    return content.getvalue().encode()
+
+
+def _table(path: Path) -> "csv.DictReader[str]":
     try:
         content = path.read_text()
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} cannot be read: {error}") from None
     table = csv.DictReader(io.StringIO(content, newline=""), strict=True)
-    runs: list[Outcome] = []
-    make = functools.cache(_config)  # once for all seeds
-    number = 1  # of the next row
     missing = set(_COLUMNS) - set(Metrics._fields) - set(table.fieldnames or ())
     expect(not missing, f"{path} is not a file of rows: it has no columns {', '.join(sorted(missing))}")
-    try:
-        for row in table:
-            expect(None not in row and None not in row.values(), "its number of cells is not that of the columns")
-            if row["algorithm"] not in without:
-                runs.append(_outcome(row, make, f"{path}, row {number}"))
-            number += 1
-    except (ValueError, TypeError, KeyError, OverflowError, RecursionError, csv.Error) as error:
-        raise ValueError(f"{path} cannot be used: row {number}: {error}") from None
-    expect(number > 1, f"{path} has no rows")
-    return runs
-
-
-def _config(given: str) -> Config:
-    """Return the configuration of a row. Rows of older versions have only what differs from the defaults."""
-    fields = json.loads(given)
-    missing = all_fields(fields["algorithm"]).keys() - fields.keys()
-    return make_config(**fields) if missing - LATER else from_plain(fields)
+    return table
 
 
 def _outcome(row: Mapping[str, str], make: Callable[[str], Config], name: str) -> Outcome:

@@ -22,7 +22,8 @@ from fleetjax.io import folder, plain, text
 from fleetjax.io.files import expect
 from fleetjax.io.flags import LAUNCHERS
 from fleetjax.io.parameters import LARGEST_SEED
-from fleetjax.registry import load, unknown
+from fleetjax.priority import get_algorithm
+from fleetjax.registry import unknown
 
 Block = Mapping[str, list[Any]]
 Group = tuple[folder.Run, ...]  # completed together by one process
@@ -188,7 +189,8 @@ def _read(path: Path) -> tuple[dict[str, Any], Block, list[Block]]:
         expect(isinstance(parts, list) and all(isinstance(part, dict) for part in parts), "runs must be [[runs]] blocks")
         for part in (content, *parts):
             for name in _as_list("algorithm", part.get("algorithm", [])):
-                load(name)  # its parameters may be in the file, too
+                if ":" in str(name):
+                    get_algorithm(name)  # its parameters may be in the file, too
         options = {name: content.pop(name) for name in _OPTIONS if name in content}
         for name, value in options.items():
             expect(type(value) is _OPTIONS[name], f"{name} = {value!r} must be of type {_OPTIONS[name].__name__}")

@@ -79,9 +79,9 @@ def as_path(name: str) -> str:
     """Return a name as it stands in the name of a file or folder.
 
     >>> as_path("navigation-my_rules:mine-num_humans=5")
-    'navigation-my_rules_mine-num_humans=5'
+    'navigation-my_rules.mine-num_humans=5'
     """
-    return re.sub(r"[^\w.=+-]", "_", name)
+    return re.sub(r"[^\w.=+-]", "_", name.replace(":", "."))
 
 
 def meaning(algorithm: str) -> str:

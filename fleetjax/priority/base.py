@@ -1,7 +1,11 @@
 """What an algorithm is made of: a rule for help, an allocator, what it learns, and parameters of its own."""
 
 import dataclasses
+import importlib
+import re
+import traceback
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -126,12 +130,34 @@ def list_algorithms() -> tuple[str, ...]:
 
 
 def get_algorithm(name: str) -> Algorithm:
-    """Return a registered algorithm.
+    """Return a registered algorithm, or of `MODULE:NAME` the `Algorithm` that a module calls NAME.
 
     Raises:
-        ValueError: if there is none of that name; the message has the closest ones.
+        ValueError: if there is none of that name; the message has the closest ones. Or if the module cannot be imported.
     """
+    if isinstance(name, str) and ":" in name and name not in ALGORITHMS:
+        register_algorithm(name, _import(*name.rsplit(":", 1)))
     return ALGORITHMS.get(name)
+
+
+def _import(module: str, name: str) -> Algorithm:
+    asked = f"algorithm = '{module}:{name}'"
+    if not re.fullmatch(r"\w+(\.\w+)*", module):
+        raise ValueError(f"{asked} must have the form MODULE:NAME, and {module!r} is not the name of a module")
+    try:
+        with jax.ensure_compile_time_eval():  # even during a trace, arrays of the module hold values
+            found = vars(importlib.import_module(module))
+    except (Exception, SystemExit) as error:  # whatever the module does
+        if isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}."):
+            raise ValueError(f"{asked}: there is no module {error.name}; put its folder on PYTHONPATH") from error
+        *_, last = traceback.extract_tb(error.__traceback__)
+        place = "" if isinstance(error, SyntaxError) else f" ({Path(last.filename).name}, line {last.lineno})"
+        raise ValueError(f"{asked}: the module cannot be imported: {type(error).__name__}: {error}{place}") from error
+    if not isinstance(found.get(name), Algorithm):
+        others = [f"{module}:{other}" for other, value in found.items() if isinstance(value, Algorithm)]
+        known = f"; there is {', '.join(others)}" if others else f"; write {name} = fleetjax.Algorithm(...) in it"
+        raise ValueError(f"{asked} is unknown: the module has no Algorithm of this name{known}")
+    return found[name]
 
 
 def estimators_of(algorithm: Algorithm, spec: Any) -> tuple[str, ...]:

@@ -7,15 +7,15 @@ A table stands between `<!-- NAME -->` and `<!-- end -->`, where NAME is one of:
 - a part of the study, such as `main`: what the algorithms achieved in it, each robot's one after the other.
 - `claims`: the verdicts of `claims.py`.
 - `missing`: how many runs of each part are stored, of how many, and what they ran on.
-- `teach_first`, `teach_more`: how Teach First compares with C.U.R. and Random at equal human time; in the second, with as many
-  gradient steps as in the part `main`.
+- `teach_first`, `teach_more`, `teach_early`: how Teach First compares with C.U.R. and others at equal human time; in the second and
+  third, with as many gradient steps as in the part `main`; in the third, with half of these before the start.
 - `leaderboard`: the table of `leaderboard.py`.
 - `people_ENV`: the table of `people.py`.
 """
 
 import argparse
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import claims
@@ -112,8 +112,13 @@ def counts(stored: Mapping[str, Outcome], number: int) -> tuple[str, ...]:
     return str(len(stored)), str(number), ", ".join(processors), ", ".join(versions)
 
 
-def against_cur(found: list[Group]) -> str:
-    """Return a table of Teach First and Random beside C.U.R.; ratios are of the successes over the seeds that both have."""
+def against_cur(found: list[Group], early: Sequence[Group] = ()) -> str:
+    """Return a table of Teach First and others beside C.U.R.; ratios are of the successes over the seeds that both have.
+
+    Args:
+        found: runs, of which the first C.U.R. of each robot is the one to compare with.
+        early: runs that are trained earlier.
+    """
     table: list[tuple[str, ...]] = [("", "seeds", "successes", "times C.U.R.'s", "violations", "human time", "idle time")]
     for place in dict.fromkeys(one.config.environment for one in found):
         here: dict[str, Group] = {}
@@ -121,16 +126,15 @@ def against_cur(found: list[Group]) -> str:
             if one.config.environment == place:
                 here.setdefault(one.config.algorithm, one)  # those of the study come before older ones
         reference = comparing.values_by_seed(here["cur"], "successes") if "cur" in here else {}
-        for algorithm in ("cur", "random", "teach_first"):
-            if algorithm in here:
-                one = here[algorithm]
-                values = comparing.values_by_seed(one, "successes")
-                shared = sorted(values.keys() & reference.keys())
-                ratio = sum(values[seed] for seed in shared) / sum(reference[seed] for seed in shared) if shared else None
-                cells = [f"{claims.NAMES[place]}, {text.label(algorithm)}", str(len(values))]
-                cells += [comparing.interval(comparing.values(one, "successes"))]
-                cells += ["" if algorithm == "cur" or ratio is None else f"{ratio:.2f}"]
-                table.append((*cells, *(mean(one, metric) for metric in ("violations", "human_steps", "idle"))))
+        shown = [(here[algorithm], "") for algorithm in ("cur", "random", "teach_first", "expert") if algorithm in here]
+        for one, how in [*shown, *((one, ", trained early") for one in early if one.config.environment == place)]:
+            values = comparing.values_by_seed(one, "successes")
+            shared = sorted(values.keys() & reference.keys())
+            ratio = sum(values[seed] for seed in shared) / sum(reference[seed] for seed in shared) if shared else None
+            cells = [f"{claims.NAMES[place]}, {text.label(one.config.algorithm)}{how}", str(len(values))]
+            cells += [comparing.interval(comparing.values(one, "successes"))]
+            cells += ["" if one is here.get("cur") or ratio is None else f"{ratio:.2f}"]
+            table.append((*cells, *(mean(one, metric) for metric in ("violations", "human_steps", "idle"))))
     return text.markdown_table(table)
 
 
@@ -149,6 +153,10 @@ def tables(results: Path) -> dict[str, Callable[[], str]]:
         "teach_first": lambda: against_cur(groups(results, "equal_budget")),
         "teach_more": lambda: against_cur(
             [one for one in groups(results, "main", "teaching") if one.config.environment == "humanoid"]
+        ),
+        "teach_early": lambda: against_cur(
+            [one for one in groups(results, "main", "teaching") if one.config.environment in ("humanoid", "anymal")],
+            groups(results, "trained_early"),
         ),
         "leaderboard": lambda: standings.table(leaderboard.Store(results)).strip(),
         **{name: lambda name=name: people.table(groups(results, name)).strip() for name in imperfect},

@@ -26,7 +26,8 @@ from fleetjax.priority import get_algorithm
 
 HERE = Path(__file__).parent
 PARTS = (  # in this order
-    *("main", "gradient_steps", "policies", "ablations", "humans", "times", "equal_budget", "demonstrations", "teaching"),
+    *("main", "gradient_steps", "policies", "ablations", "humans", "times", "equal_budget", "demonstrations"),
+    *("teaching", "trained_early"),
 )
 TRAINED = "main"  # the part whose policies are evaluated
 METRICS = {

@@ -7,8 +7,8 @@ A table stands between `<!-- NAME -->` and `<!-- end -->`, where NAME is one of:
 - a part of the study, such as `main`: what the algorithms achieved in it, each robot's one after the other.
 - `claims`: the verdicts of `claims.py`.
 - `missing`: how many runs of each part are stored, of how many, and what they ran on.
-- `teach_first`, `teach_more`, `teach_early`: how Teach First compares with C.U.R. and others at equal human time; in the second and
-  third, with as many gradient steps as in the part `main`; in the third, with half of these before the start.
+- `teach_first`, `teach_more`, `teach_early`: how Teach First compares with C.U.R. and others at equal human time; in the second
+  and third, with as many gradient steps as in the part `main`; in the third, with half of these before the start.
 - `leaderboard`: the table of `leaderboard.py`.
 - `people_ENV`: the table of `people.py`.
 """

@@ -142,21 +142,21 @@ def get_algorithm(name: str) -> Algorithm:
 
 def _import(module: str, name: str) -> Algorithm:
     asked = f"algorithm = '{module}:{name}'"
-    if not re.fullmatch(r"\w+(\.\w+)*", module):
-        raise ValueError(f"{asked} must have the form MODULE:NAME, and {module!r} is not the name of a module")
+    if not re.fullmatch(r"\w+(\.\w+)*", module) or not name.isidentifier():
+        raise ValueError(f"{asked} must have the form MODULE:NAME, as my_rules:mine has")
     try:
         with jax.ensure_compile_time_eval():  # even during a trace, arrays of the module hold values
             found = vars(importlib.import_module(module))
     except (Exception, SystemExit) as error:  # whatever the module does
         if isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}."):
-            raise ValueError(f"{asked}: there is no module {error.name}; put its folder on PYTHONPATH") from error
+            raise ValueError(f"{asked}: there is no module {error.name}; add the folder that holds it to PYTHONPATH") from error
         *_, last = traceback.extract_tb(error.__traceback__)
         place = "" if isinstance(error, SyntaxError) else f" ({Path(last.filename).name}, line {last.lineno})"
-        raise ValueError(f"{asked}: the module cannot be imported: {type(error).__name__}: {error}{place}") from error
+        raise ValueError(f"{asked}: importing the module failed: {type(error).__name__}: {error}{place}") from error
     if not isinstance(found.get(name), Algorithm):
         others = [f"{module}:{other}" for other, value in found.items() if isinstance(value, Algorithm)]
-        known = f"; there is {', '.join(others)}" if others else f"; write {name} = fleetjax.Algorithm(...) in it"
-        raise ValueError(f"{asked} is unknown: the module has no Algorithm of this name{known}")
+        known = f"it has {', '.join(others)}" if others else f"define {name} = fleetjax.Algorithm(...) there"
+        raise ValueError(f"{asked}: module {module} has no fleetjax.Algorithm named {name!r}; {known}")
     return found[name]
 
 

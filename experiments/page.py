@@ -126,8 +126,9 @@ def against_cur(found: list[Group], early: Sequence[Group] = ()) -> str:
             if one.config.environment == place:
                 here.setdefault(one.config.algorithm, one)  # those of the study come before older ones
         reference = comparing.values_by_seed(here["cur"], "successes") if "cur" in here else {}
-        shown = [(here[algorithm], "") for algorithm in ("cur", "random", "teach_first", "expert") if algorithm in here]
-        for one, how in [*shown, *((one, ", trained early") for one in early if one.config.environment == place)]:
+        usual = [(here[algorithm], "") for algorithm in ("cur", "random", "teach_first") if algorithm in here]
+        others = [(one, ", trained early") for one in early if one.config.environment == place]
+        for one, how in (*usual, *others, *([(here["expert"], "")] if "expert" in here else [])):
             values = comparing.values_by_seed(one, "successes")
             shared = sorted(values.keys() & reference.keys())
             ratio = sum(values[seed] for seed in shared) / sum(reference[seed] for seed in shared) if shared else None

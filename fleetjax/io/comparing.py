@@ -115,13 +115,14 @@ def _kind(seeds: int) -> str:
 
 
 def interval(values: np.ndarray) -> str:
-    """Return the mean of values f64[S] with its 95 % interval, or their range where there are few, as text.
+    """Return the mean of values f64[S] with its 95 % interval, or their range where there are few, as text; one value alone.
 
-    >>> interval(np.array([3.0, 1.0, 2.0]))
-    '2 (1 to 3)'
+    >>> interval(np.array([3.0, 1.0, 2.0])), interval(np.array([3.0]))
+    ('2 (1 to 3)', '3')
     """
     low, high = statistics.mean_bounds(values)
-    return f"{text.number(float(values.mean()))} ({text.number(float(low))} to {text.number(float(high))})"
+    mean = text.number(float(values.mean()))
+    return mean if len(values) == 1 else f"{mean} ({text.number(float(low))} to {text.number(float(high))})"
 
 
 def values(one: Group, metric: str) -> np.ndarray:

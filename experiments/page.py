@@ -128,7 +128,8 @@ def against_cur(found: list[Group], early: Sequence[Group] = ()) -> str:
         reference = comparing.values_by_seed(here["cur"], "successes") if "cur" in here else {}
         usual = [(here[algorithm], "") for algorithm in ("cur", "random", "teach_first") if algorithm in here]
         others = [(one, ", trained early") for one in early if one.config.environment == place]
-        for one, how in (*usual, *others, *([(here["expert"], "")] if "expert" in here else [])):
+        ceiling = [(one, "") for algorithm, one in here.items() if algorithm == "expert"]
+        for one, how in (*usual, *others, *ceiling):
             values = comparing.values_by_seed(one, "successes")
             shared = sorted(values.keys() & reference.keys())
             ratio = sum(values[seed] for seed in shared) / sum(reference[seed] for seed in shared) if shared else None

@@ -120,9 +120,11 @@ def interval(values: np.ndarray) -> str:
     >>> interval(np.array([3.0, 1.0, 2.0])), interval(np.array([3.0]))
     ('2 (1 to 3)', '3')
     """
-    low, high = statistics.mean_bounds(values)
     mean = text.number(float(values.mean()))
-    return mean if len(values) == 1 else f"{mean} ({text.number(float(low))} to {text.number(float(high))})"
+    if len(values) == 1:
+        return mean
+    low, high = statistics.mean_bounds(values)
+    return f"{mean} ({text.number(float(low))} to {text.number(float(high))})"
 
 
 def values(one: Group, metric: str) -> np.ndarray:

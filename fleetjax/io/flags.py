@@ -122,15 +122,17 @@ def _import_algorithms(argv: Sequence[str]) -> None:
     """
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     early.add_argument("--algorithm", action="append", nargs="?", default=[])
-    for names in early.parse_known_args(argv)[0].algorithm:
-        for name in (names or "").split(","):
-            if ":" in name:
-                from fleetjax.priority import get_algorithm  # on demand: it loads JAX
+    given = ",".join(filter(None, early.parse_known_args(argv)[0].algorithm))
+    named = [name.strip() for name in given.split(",") if ":" in name]
+    if not named:
+        return
+    from fleetjax.priority import get_algorithm  # on demand: it loads JAX
 
-                try:
-                    get_algorithm(name.strip())
-                except ValueError as error:
-                    raise Refusal(str(error)) from None
+    try:
+        for name in named:
+            get_algorithm(name)
+    except ValueError as error:
+        raise Refusal(str(error)) from None
 
 
 def make_parser(environment: str | None = None) -> tuple[argparse.ArgumentParser, list[str]]:

@@ -13,10 +13,15 @@ QUICK_FLAGS = "--xla_cpu_use_fusion_emitters=false"
 
 # Files that take longest. They begin first, so that the workers end at about the same time.
 LONGEST = (
+    "mesh",
+    "gates",
+    "gradients",
     "resume",
+    "sweep",
+    "distributed",
+    "humans",
     "faults",
     "conformity",
-    "gradients",
     "fuzz",
     "console_web",
     "oracle",
@@ -54,7 +59,8 @@ def compiled_both_ways() -> None:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the longest files first."""
-    items.sort(key=lambda item: item.path.stem.removeprefix("test_") not in LONGEST)
+    order = {name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: order.get(item.path.stem.removeprefix("test_"), len(LONGEST)))
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -174,8 +174,15 @@ def test_a_process_says_in_one_line_that_another_was_killed(lost):
     assert line.endswith("; repeat the same command")
 
 
-@pytest.mark.parametrize("lost", [0, 1])
-@pytest.mark.parametrize(("timeout", "silence"), [(10, 600), pytest.param(600, 10, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    ("lost", "timeout", "silence"),
+    [
+        (0, 10, 600),
+        pytest.param(1, 10, 600, marks=pytest.mark.slow),
+        pytest.param(0, 600, 10, marks=pytest.mark.long),
+        pytest.param(1, 600, 10, marks=pytest.mark.long),
+    ],
+)
 def test_a_process_says_in_one_line_that_another_hangs(lost, timeout, silence):
     started = exchanging(timeout, silence)
     started[lost].send_signal(signal.SIGSTOP)

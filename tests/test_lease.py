@@ -58,7 +58,7 @@ def test_an_owner_that_renews_keeps_its_run_for_longer_than_a_term(tmp_path, mon
     mine, other = Leases(tmp_path, "sweep", SOME), Leases(tmp_path, "sweep", SOME)
     assert mine.is_free(mine.look(RUN))
     with mine.taken(RUN):
-        until = time.monotonic() + 2 * SOME
+        until = time.monotonic() + 1.5 * SOME
         while time.monotonic() < until:
             assert not other.is_free(other.look(RUN))
             time.sleep(SHORT / 20)

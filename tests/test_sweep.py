@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import cache
 from pathlib import Path
 
 import jax
@@ -343,13 +344,14 @@ def groups_of(*arguments: object, output: Path) -> list[study.Group]:
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory):
-    """Metrics[T] of plain runs of the expert, by the number of timesteps and the name of the run."""
-    found = {}
-    for steps in (40, LONG):
-        output = tmp_path_factory.mktemp("alone")
-        runs = planned(NAV, *EXPERT, "--num-steps", steps, output=output)
-        found[steps] = {name: resumable.complete(run, checkpoint_every=0) for name, run in runs.items()}
-    return found
+    """A function of the number of timesteps, which returns Metrics[T] of plain runs of the expert by their names."""
+
+    @cache
+    def metrics_of(steps):
+        runs = planned(NAV, *EXPERT, "--num-steps", steps, output=tmp_path_factory.mktemp("alone"))
+        return {name: resumable.complete(run, checkpoint_every=0) for name, run in runs.items()}
+
+    return metrics_of
 
 
 def assert_agree(path: Path, metrics) -> None:
@@ -369,7 +371,7 @@ def test_seeds_side_by_side_are_ordinary_runs(tmp_path, alone, monkeypatch, caps
     for run in (*first, *second):
         assert set(contents(run.folder)) == {"config.json", "metrics.csv", "figure.png"}
         assert sweep.is_finished(run)
-        assert_agree(run.folder, alone[40][run.folder.name])
+        assert_agree(run.folder, alone(40)[run.folder.name])
     before = everything(tmp_path)
     shutil.rmtree(first[1].folder)
     assert group.complete(first, checkpoint_every=0) == ["", ""]  # once more, but what was there stays as it was
@@ -391,7 +393,7 @@ def test_one_run_of_a_group_may_fail(tmp_path, alone, monkeypatch):
     one, other = group_of_two
     assert rows(one.folder) == 10
     assert not sweep.is_finished(one)
-    assert_agree(other.folder, alone[40][other.folder.name])
+    assert_agree(other.folder, alone(40)[other.folder.name])
 
 
 def test_a_group_that_was_stopped_starts_again(tmp_path, alone, monkeypatch):
@@ -405,7 +407,7 @@ def test_a_group_that_was_stopped_starts_again(tmp_path, alone, monkeypatch):
         group.complete(group_of_two, checkpoint_every=0)
     assert group.complete(group_of_two, checkpoint_every=0) == ["", ""]
     for run in group_of_two:
-        assert_agree(run.folder, alone[40][run.folder.name])
+        assert_agree(run.folder, alone(40)[run.folder.name])
 
 
 def test_more_seeds_must_leave_groups_as_they_are(capsys, tmp_path):
@@ -700,7 +702,7 @@ def test_groups_survive_kills(tmp_path, spawn, alone, options):
         code, _, said = end(spawn(*command))
         assert said[0] == "4 runs, 2 of them finished already"
     assert code == 0, said
-    for name, metrics in alone[LONG].items():
+    for name, metrics in alone(LONG).items():
         assert_agree(output / name, metrics)
 
 

@@ -41,7 +41,14 @@ class Scale(NamedTuple):
 
 
 def solve(
-    measure: Callable[[float], float], wanted: float, start: float, scale: Scale, *, tolerance: float, most: int
+    measure: Callable[[float], float],
+    wanted: float,
+    start: float,
+    scale: Scale,
+    *,
+    tolerance: float,
+    most: int,
+    step: float = FIRST_STEP,
 ) -> list[tuple[float, float]]:
     """Measure at one value after another, until one gives what is wanted or no measurement is left.
 
@@ -55,6 +62,7 @@ def solve(
         scale: of the values.
         tolerance: relative difference that is near enough.
         most: measurements at most.
+        step: first step, in the scaled parameter.
 
     Returns:
         Values and what was measured there, in order; the nearest need not be the last.
@@ -71,7 +79,7 @@ def solve(
             break
         following = _between(tried, wanted)
         if following is None:
-            following = _beyond(tried, wanted, scale)
+            following = _beyond(tried, wanted, scale, step)
         if following is None:
             break
         scaled = following
@@ -92,10 +100,10 @@ def _between(tried: dict[float, float], wanted: float) -> float | None:
     return a + (b - a) * min(max(share, 0.15), 0.85)  # else one end could stay for ever
 
 
-def _beyond(tried: dict[float, float], wanted: float, scale: Scale) -> float | None:
+def _beyond(tried: dict[float, float], wanted: float, scale: Scale, step: float) -> float | None:
     """Return where to measure outside of all values so far, now on one side, now on the other; None if both are exhausted."""
     places = sorted(tried)
-    step = FIRST_STEP * 1.5 ** (len(places) - 1)
+    step *= 1.5 ** (len(places) - 1)
     up, down = places[-1] + step, places[0] - step
     upward = (tried[places[-1 if scale.rises else 0]] > wanted) != scale.rises
     if len(places) >= 3 and abs(tried[places[0 if upward else -1]] - wanted) < abs(tried[places[-1 if upward else 0]] - wanted):

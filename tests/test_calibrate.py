@@ -1,13 +1,15 @@
 """`fleetjax calibrate`: the value of a parameter at which an algorithm spends a given human time."""
 
 import json
+import math
 
 import numpy as np
 import pytest
 from commands import refused
 
+import fleetjax
 from fleetjax import cli
-from fleetjax.io import folder
+from fleetjax.io import calibration, folder
 
 SMALL = [
     *("navigation", "--algorithm", "random", "--num-robots", "20", "--num-humans", "4", "--num-steps", "60"),
@@ -45,6 +47,43 @@ def test_the_same_command_answers_from_what_it_ran(solved, capsys):
     assert calibrate(solved, "--human-time", 120, "--seeds", 3, "--tolerance", 0.1) == 0
     assert {path: path.stat().st_mtime_ns for path in solved.glob("*/metrics.csv")} == before
     assert capsys.readouterr().out.startswith("random_threshold = 0.9")
+
+
+def calibrated(tmp_path, monkeypatch, human_time, **options):
+    """Calibrate Random where a run spends `human_time(threshold, seed)`; return what was found and the runs that it took."""
+    config = fleetjax.make_config("navigation", "random")
+    request = calibration.Request(config, "random_threshold", 1000.0, (0, 1, 2), 0.1, 5, tmp_path)._replace(**options)
+    runs = []
+
+    def spend(request, value, seed):
+        runs.append((value, seed))
+        return float(human_time(value, seed))
+
+    monkeypatch.setattr(calibration, "_human_time", spend)
+    return calibration.calibrate(request), runs
+
+
+@pytest.mark.parametrize("others", [0.5, 0.8, 1.3, 3.0])
+def test_the_mean_over_all_seeds_is_what_is_solved(tmp_path, monkeypatch, others):
+    found, runs = calibrated(tmp_path, monkeypatch, lambda x, seed: 2e4 * (1 - x) * (others if seed else 1))
+    assert found.solved
+    assert np.mean(found.human_time) == pytest.approx(1000, rel=0.1)
+    assert 2e4 * (1 - found.value) * (1 + 2 * others) / 3 == pytest.approx(1000, rel=0.1)
+    assert len(runs) == len(set(runs)) <= 5 + 3 * 5
+
+
+def test_a_first_value_that_is_near_enough_for_one_seed_alone_is_corrected(tmp_path, monkeypatch):
+    config = fleetjax.make_config("navigation", "random", random_threshold=0.95)
+    found, _ = calibrated(tmp_path, monkeypatch, lambda x, seed: 2e4 * (1 - x) * (2 if seed else 1), config=config)
+    assert found.solved
+    assert found.value == pytest.approx(0.97, abs=0.005)
+
+
+def test_of_values_with_all_seeds_the_nearest_is_taken(tmp_path, monkeypatch):
+    found, _ = calibrated(tmp_path, monkeypatch, lambda x, seed: (500 if x > 0.9 else 1400) + 300 * (seed == 1))
+    assert not found.solved
+    assert found.human_time == (500, 800, 500)  # with the first seed alone, 1,400 is nearer
+    assert math.isnan(found.error)
 
 
 @pytest.mark.slow

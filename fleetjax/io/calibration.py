@@ -1,5 +1,6 @@
 """The value of a parameter at which an algorithm spends a given human time: thresholds do not carry over."""
 
+import functools
 import math
 from pathlib import Path
 from typing import NamedTuple
@@ -9,7 +10,7 @@ import numpy as np
 from fleetjax.config import Config, all_fields, check_one_for_all, get_value, validate
 from fleetjax.io import files, folder, resumable, text
 from fleetjax.io.progress import say
-from fleetjax.search import Scale, solve
+from fleetjax.search import FIRST_STEP, Scale, solve
 
 FILE = "calibration.json"
 
@@ -21,9 +22,9 @@ class Request(NamedTuple):
         config: configuration; the field has its first value.
         field: name of the traced field or parameter.
         human_time: human timesteps, hard resets included, that a run should spend.
-        seeds: of the runs; the search takes the first, all confirm what it finds.
+        seeds: of the runs; the search takes the first, then all.
         tolerance: relative difference in human time that is near enough.
-        most: runs that the search may take.
+        most: values that each of the two searches may try.
         output: folder of the run folders.
         checkpoint_every: timesteps between checkpoints; 0 = none.
     """
@@ -39,10 +40,8 @@ class Request(NamedTuple):
 
     def run(self, value: float, seed: int) -> folder.Run:
         """Return a run with this value of the field."""
-        exact = np.float32(value)
-        return folder.Run(
-            self.output / f"{self.field}-{exact!s}-seed{seed}", self.config.replace(**{self.field: float(exact)}), seed
-        )
+        name = f"{self.field}-{np.float32(value)!s}-seed{seed}"
+        return folder.Run(self.output / name, self.config.replace(**{self.field: _stored(value)}), seed)
 
 
 class Calibration(NamedTuple):
@@ -101,34 +100,42 @@ def check(request: Request) -> None:
 
 
 def calibrate(request: Request) -> Calibration:
-    """Run until the value is found; runs that `output` holds already are not repeated."""
+    """Search with the first seed; from there, search for the mean over all seeds.
+
+    Runs that `output` holds already are not repeated.
+    """
     field = all_fields(request.config.algorithm)[request.field]
     most = math.inf if field.high is None else field.high
     scale = Scale(field.high == 1, field.low or 0.0, most, rises=request.field.endswith(("_rate", "_time")))
-    first, *others = request.seeds
-    start = float(get_value(request.config, request.field))
-    tried = solve(
-        lambda value: _human_time(request, value, first),
-        request.human_time,
-        start,
-        scale,
-        tolerance=request.tolerance,
-        most=request.most,
-    )
-    value, _ = min(tried, key=lambda pair: abs(pair[1] - request.human_time))
-    spent = _over_seeds(request, value, others, tried)
-    moved = _corrected(request, value, spent, tried, scale) if others else None
-    if moved is not None:
-        tried.append((moved, _human_time(request, moved, first)))
-        again = _over_seeds(request, moved, others, tried)
-        if abs(np.mean(again) - request.human_time) < abs(np.mean(spent) - request.human_time):
-            value, spent = moved, again
+    spend = functools.cache(functools.partial(_human_time, request))
+
+    def search(seeds: tuple[int, ...], start: float, step: float = FIRST_STEP) -> list[tuple[float, float]]:
+        def mean(value: float) -> float:
+            return float(np.mean([spend(_stored(value), seed) for seed in seeds]))
+
+        found = solve(mean, request.human_time, start, scale, tolerance=request.tolerance, most=request.most, step=step)
+        return [(_stored(value), spent) for value, spent in found]
+
+    first = request.seeds[:1]
+    tried = search(first, float(get_value(request.config, request.field)))
+    value = _nearest(request, tried)
+    if len(request.seeds) > 1:
+        spent = np.mean([spend(value, seed) for seed in request.seeds])
+        means = search(request.seeds, value, _step(request, value, float(spent), tried, scale))
+        tried += [(other, spend(other, *first)) for other, _ in means if other not in dict(tried)]
+        value = _nearest(request, means)
+    spent = tuple(spend(value, seed) for seed in request.seeds)
     found = Calibration(value, spent, _error(value, spent, tried, scale), _is_near(request, spent), tried)
     content = found._asdict() | {"field": request.field, "wanted": request.human_time, "seeds": request.seeds}
     if math.isnan(found.error):
         content["error"] = None  # JSON has no NaN
     files.write_json(request.output / FILE, content | {"versions": folder.versions()})
     return found
+
+
+def _stored(value: float) -> float:
+    """Return a value as a configuration stores it."""
+    return float(np.float32(value))
 
 
 def _human_time(request: Request, value: float, seed: int) -> float:
@@ -139,8 +146,9 @@ def _human_time(request: Request, value: float, seed: int) -> float:
     return spent
 
 
-def _over_seeds(request: Request, value: float, others: list[int], tried: list[tuple[float, float]]) -> tuple[float, ...]:
-    return (dict(tried)[value], *(_human_time(request, value, seed) for seed in others))
+def _nearest(request: Request, tried: list[tuple[float, float]]) -> float:
+    """Return the value that spends nearly what is wanted."""
+    return min(tried, key=lambda pair: abs(pair[1] - request.human_time))[0]
 
 
 def _is_near(request: Request, spent: tuple[float, ...]) -> bool:
@@ -158,15 +166,13 @@ def _slope(value: float, tried: list[tuple[float, float]], scale: Scale) -> floa
     return (math.log1p(dict(tried)[value]) - math.log1p(spent)) / (here - place)
 
 
-def _corrected(
-    request: Request, value: float, spent: tuple[float, ...], tried: list[tuple[float, float]], scale: Scale
-) -> float | None:
-    """Return the value at which the mean over seeds should be what is wanted; None if it is, or the slope does not tell."""
+def _step(request: Request, value: float, spent: float, tried: list[tuple[float, float]], scale: Scale) -> float:
+    """Return how far away the mean over seeds should be what is wanted, by the slope of the first seed, if it tells."""
     slope = _slope(value, tried, scale)
-    if _is_near(request, spent) or not abs(slope) > 1e-3:
-        return None
-    change = (math.log1p(request.human_time) - math.log1p(float(np.mean(spent)))) / slope
-    return scale.outward(scale.inward(value) + min(max(change, -1.0), 1.0))
+    if not abs(slope) > 1e-3:
+        return FIRST_STEP
+    change = abs((math.log1p(request.human_time) - math.log1p(spent)) / slope)
+    return min(max(change, 0.1), FIRST_STEP)
 
 
 def _error(value: float, spent: tuple[float, ...], tried: list[tuple[float, float]], scale: Scale) -> float:
@@ -174,6 +180,8 @@ def _error(value: float, spent: tuple[float, ...], tried: list[tuple[float, floa
     if len(spent) < 2 or not abs(slope) > 1e-3:
         return math.nan
     scaled = float(np.std(np.log1p(spent), ddof=1)) / math.sqrt(len(spent)) / abs(slope)
+    if scaled > 1:  # the curve is too flat there for a straight line
+        return math.nan
     here = scale.inward(value)
     return (scale.outward(here + scaled) - scale.outward(here - scaled)) / 2
 

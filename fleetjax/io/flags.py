@@ -40,9 +40,9 @@ that was stopped, and a larger one extends it.
 Every parameter takes a list: --algorithm cur,random --num-humans 5,10 --hidden-sizes 64 64,256 256. A parameter of one
 algorithm is given to that algorithm alone. A FILE holds the same names with lists, in TOML; flags override it."""
 _CALIBRATE_ABOUT = """\
-Find the value of a parameter at which an algorithm spends a given human time, by a few runs with the first seed, and confirm it
-with the others. Thresholds do not carry over between robots, policies or sizes of a run. The runs are kept below DIR, so the
-same command resumes; repeated when it is finished, it prints the result at once."""
+Find the value of a parameter at which an algorithm spends a given human time, by a few runs with the first seed. Then go on from
+there with the mean over all seeds. Thresholds do not carry over between robots, policies or sizes of a run. The runs are kept
+below DIR, so the same command resumes; repeated when it is finished, it prints the result at once."""
 _RUN_NOTE = """\
 Some algorithms change defaults: expert has as many humans as robots; constraint gets as many extra demonstrations as C.U.R.
 uses human timesteps (none for environments that are not part of fleetjax); constraint_trained also takes as many gradient steps
@@ -343,7 +343,7 @@ def _add_calibrate(commands: Any, environment: str | None) -> None:
     near = "relative difference that is near enough [default: 0.05]"
     calibrate.add_argument("--tolerance", metavar="X", type=number, default=0.05, help=near)
     calibrate.add_argument(
-        "--most", metavar="N", type=integer, default=10, help="largest number of runs in the search [default: 10]"
+        "--most", metavar="N", type=integer, default=10, help="values that each of the two searches may try [default: 10]"
     )
     calibrate.add_argument("--output", metavar="DIR", type=Path, help="folder of its runs [default: below runs/]")
     every = "timesteps between the checkpoints of a run; 0 = none [default: 1000]"

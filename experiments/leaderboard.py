@@ -11,15 +11,17 @@ stored, or finished below --output, are not run again.
 import argparse
 from pathlib import Path
 
+import fleetjax
 from fleetjax.io import files, leaderboard, scripts, standings
 from fleetjax.io.lists import listed
 
-ORDER = (  # in which they are run
-    *("cur", "random", "teach_first", "ensemble_dagger", "round_robin", "lazy_dagger"),
-    *("oracle_discrepancy", "quantile_ensemble"),
-    *("thrifty_quantile", "conformal", "safe_dagger", "crsail", "aim", "dropout_dagger", "asa", "weighted", "whittle", "iifl"),
-    *("constraint", "constraint_trained", "longest_waiting", "thrifty_dagger"),
-)
+FIRST = ("cur", "random", "teach_first", "ensemble_dagger", "round_robin")  # to be run
+
+
+def every_rule() -> list[str]:
+    """Return the names of all rules but orders of letters and expert, in the order in which they are run."""
+    rules = [name for name in fleetjax.list_algorithms() if name == "cur" or (name != "expert" and set(name) - set("cur"))]
+    return sorted(rules, key=lambda name: FIRST.index(name) if name in FIRST else len(FIRST))
 
 
 def main() -> None:
@@ -43,13 +45,14 @@ def main() -> None:
         asked = (args.environments, args.budgets or (), args.seeds, args.output)
         try:
             store = leaderboard.Store(args.results)
-            entries = [] if args.rows_only else leaderboard.entries(args.algorithms or ORDER, *asked)
+            entries = [] if args.rows_only else leaderboard.entries(args.algorithms or every_rule(), *asked)
+            failed = leaderboard.compete(store, entries)
         except ValueError as error:
             parser.error(str(error))
-        for entry in entries:
-            leaderboard.compete(store, entry)
         if store.runs:
             print(standings.publish(store))
+    if failed:
+        raise SystemExit(f"failed: {'; '.join(failed)}")
 
 
 if __name__ == "__main__":

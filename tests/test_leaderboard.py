@@ -9,7 +9,8 @@ from commands import make_metrics, refused
 
 import fleetjax
 from fleetjax import cli
-from fleetjax.io import calibration, leaderboard, resumable, sources
+from fleetjax.io import calibration, folder, leaderboard, resumable, sources
+from fleetjax.io.errors import Diverged
 
 
 @pytest.fixture
@@ -177,6 +178,76 @@ def test_only_runs_with_the_tuned_values_count(stored):
     assert store.group_of(place._replace(risk_threshold=0.5)) is not None
 
 
+@pytest.fixture
+def add(tmp_path, monkeypatch):
+    """A function that adds rules by the command, with runs that are made up; it returns the exit code.
+
+    Random diverges if `diverges`. Changed defaults are those of navigation.
+    """
+
+    def add(*rules, diverges=False, **defaults):
+        done: list[folder.Run] = []
+
+        def complete(run, **_):
+            if diverges and run.config.algorithm == "random":
+                raise Diverged("the policy is no longer finite")
+            done.append(run)
+
+        def collect(_):
+            return sources.collect([(done[-1].config, done[-1].seed, make_metrics(0, 40))])
+
+        def tune(entry):
+            return leaderboard.Place(*entry[:3], "random_threshold", 0.9, 300.0, solved=True)
+
+        for name, replacement in {"tune": tune, "collect": collect}.items():
+            monkeypatch.setattr(leaderboard, name, replacement)
+        monkeypatch.setattr(leaderboard, "make_config", functools.partial(fleetjax.make_config, num_steps=40, **defaults))
+        monkeypatch.setattr(resumable, "complete", complete)
+        where = ("--results", tmp_path, "--output", tmp_path / "runs")
+        command = ("leaderboard", "add", *rules, "--environments", "navigation", "--budgets", 300, *where)
+        return cli.main([*map(str, command)])
+
+    return add
+
+
+def test_runs_of_other_defaults_are_never_compared(tmp_path, add, capsys):
+    assert add("random") == 0
+    before = (tmp_path / "leaderboard.csv").read_bytes()
+    for rule in ("random", "constraint"):
+        assert add(rule, hard_reset_time=7) == 2
+        reason = "the stored runs of random on navigation have other settings (hard_reset_time = 7, but the run has 5)"
+        assert reason in capsys.readouterr().err
+    assert (tmp_path / "leaderboard.csv").read_bytes() == before
+    leaderboard.remove(tmp_path, ["random"])
+    assert add("random", hard_reset_time=7) == 0
+
+
+@pytest.mark.parametrize("newest_first", [False, True])
+def test_of_two_settings_that_are_stored_todays_stand_in_the_table(tmp_path, add, newest_first):
+    assert add("random") == 0
+    store = leaderboard.Store(tmp_path)
+    others = [run._replace(config=run.config.replace(hard_reset_time=7)) for run in store.runs[:1]]
+    store.runs = others + store.runs if newest_first else store.runs + others
+    found = store.group_of(store.places[0])
+    assert found is not None
+    assert len(found.runs) == 5
+
+
+def test_a_rule_that_fails_does_not_stop_the_others(tmp_path, add, capsys):
+    assert add("random", "constraint", diverges=True) == 1
+    printed = capsys.readouterr().err
+    assert "Random on navigation at 300 human timesteps failed: the policy is no longer finite" in printed
+    assert "1 of 2 failed: Random on navigation at 300 human timesteps" in printed
+    assert [run.config.algorithm for run in leaderboard.Store(tmp_path).runs] == ["constraint"] * 5
+
+
+def test_a_calibration_without_runs_can_be_removed(tmp_path):
+    leaderboard.Store(tmp_path).add(leaderboard.Place("navigation", "random", 5000, "random_threshold", 0.9, 5e3, solved=True))
+    assert not (tmp_path / "leaderboard.csv").exists()
+    assert cli.main(["leaderboard", "remove", "random", "--results", str(tmp_path)]) == 0
+    assert not leaderboard.Store(tmp_path).places
+
+
 @pytest.mark.slow
 def test_an_interrupted_rule_goes_on_where_it_stopped(tmp_path, monkeypatch):
     small = {
@@ -199,7 +270,7 @@ def test_an_interrupted_rule_goes_on_where_it_stopped(tmp_path, monkeypatch):
     monkeypatch.setattr(resumable, "complete", interrupted)
     (tmp_path / "results").mkdir()
     entry, stop = leaderboard.entries(["teach_first"], ["navigation"], (90,), 3, tmp_path / "runs")[0], 10**9
-    leaderboard.compete(leaderboard.Store(tmp_path / "results"), entry)
+    leaderboard.compete(leaderboard.Store(tmp_path / "results"), [entry])
     whole, number = leaderboard.Store(tmp_path / "results"), len(done)
     place = whole.places[0]
     assert place.solved
@@ -212,10 +283,10 @@ def test_an_interrupted_rule_goes_on_where_it_stopped(tmp_path, monkeypatch):
     done.clear()
     stop = number - 1  # before the last seed
     with pytest.raises(KeyboardInterrupt):
-        leaderboard.compete(leaderboard.Store(tmp_path / "results"), entry)
+        leaderboard.compete(leaderboard.Store(tmp_path / "results"), [entry])
     assert [run.seed for run in leaderboard.Store(tmp_path / "results").runs] == [0, 1]
     stop = 10**9
-    leaderboard.compete(leaderboard.Store(tmp_path / "results"), entry)
+    leaderboard.compete(leaderboard.Store(tmp_path / "results"), [entry])
     assert len(done) == number
     again = leaderboard.Store(tmp_path / "results")
     assert again.places == whole.places

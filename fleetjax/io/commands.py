@@ -32,7 +32,7 @@ from fleetjax.io import (
     sweep,
     text,
 )
-from fleetjax.io.errors import Refusal
+from fleetjax.io.errors import Incomplete, Refusal
 from fleetjax.io.parameters import IN_CONSOLE
 from fleetjax.io.progress import progress, say
 from fleetjax.metrics import Metrics
@@ -423,10 +423,11 @@ def lead(arguments: argparse.Namespace) -> None:
                 leaderboard.remove(arguments.results, arguments.algorithms)
                 say("their run folders remain: before you add a changed rule, delete them or choose another --output")
             store = leaderboard.Store(arguments.results)
-            for entry in entries:
-                leaderboard.compete(store, entry)
+            failed = leaderboard.compete(store, entries)
             page = standings.publish(store)
             print(page if store.runs else "no stored runs are left")
+    if failed:
+        raise Incomplete(f"{len(failed)} of {len(entries)} failed: {'; '.join(failed)}")
 
 
 COMMANDS: Mapping[str, Callable[[argparse.Namespace], None]] = {

@@ -40,9 +40,9 @@ that was stopped, and a larger one extends it.
 Every parameter takes a list: --algorithm cur,random --num-humans 5,10 --hidden-sizes 64 64,256 256. A parameter of one
 algorithm is given to that algorithm alone. A FILE holds the same names with lists, in TOML; flags override it."""
 _CALIBRATE_ABOUT = """\
-Find the value of a parameter at which an algorithm spends a given human time, by a few runs with the first seed. Then go on from
-there with the mean over all seeds. Thresholds do not carry over between robots, policies or sizes of a run. The runs are kept
-below DIR, so the same command resumes; repeated when it is finished, it prints the result at once."""
+Find the value of a parameter at which an algorithm spends a given human time, by a few runs with the first seed. Then go on
+from there with the mean over all seeds. Thresholds do not carry over between robots, policies or sizes of a run. The runs are
+kept below DIR, so the same command resumes; repeated when it is finished, it prints the result at once."""
 _RUN_NOTE = """\
 Some algorithms change defaults: expert has as many humans as robots; constraint gets as many extra demonstrations as C.U.R.
 uses human timesteps (none for environments that are not part of fleetjax); constraint_trained also takes as many gradient steps

@@ -10,7 +10,7 @@ initial period; elsewhere no rule has one. Extra demonstrations count as human t
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,7 +19,9 @@ import numpy as np
 from fleetjax.checks import check_run
 from fleetjax.config import Config, get_value, make_config
 from fleetjax.io import calibration, files, folder, resumable, rows, text
+from fleetjax.io.errors import Diverged
 from fleetjax.io.outcomes import Group, Outcome, group
+from fleetjax.io.plain import to_plain
 from fleetjax.io.progress import say
 from fleetjax.io.sources import collect
 from fleetjax.priority import get_algorithm
@@ -77,8 +79,12 @@ class Entry(NamedTuple):
     @property
     def config(self) -> Config:
         """The configuration before it is calibrated."""
-        early = {} if self.environment in ROBOTS else {"initial_period": 0}
-        return make_config(self.environment, self.algorithm, **early)
+        return _uncalibrated(self.environment, self.algorithm)
+
+    @property
+    def name(self) -> str:
+        """What the user is told."""
+        return f"{text.label(self.algorithm)} on {self.environment} at {self.budget:,} human timesteps"
 
     @property
     def folder(self) -> Path:
@@ -98,6 +104,11 @@ class Entry(NamedTuple):
             )
             for risk in effort.risk_thresholds
         }
+
+
+def _uncalibrated(environment: str, algorithm: str) -> Config:
+    early = {} if environment in ROBOTS else {"initial_period": 0}
+    return make_config(environment, algorithm, **early)
 
 
 class Place(NamedTuple):
@@ -129,6 +140,11 @@ class Place(NamedTuple):
         tuned = {self.field: self.value} if self.field else {}
         return tuned if self.risk_threshold is None else tuned | {"risk_threshold": self.risk_threshold}
 
+    @property
+    def config(self) -> Config:
+        """The configuration of its runs."""
+        return _uncalibrated(self.environment, self.algorithm).replace(**self.settings)
+
 
 class Store:
     """The stored calibrations and rows.
@@ -151,22 +167,29 @@ class Store:
         return next((place for place in self.places if place[:3] == wanted), None)
 
     def add(self, place: Place, found: Sequence[Outcome] = ()) -> None:
-        """Store a calibration, and runs that were not stored."""
-        self.places = [*(other for other in self.places if other[:3] != place[:3]), place]
+        """Store a calibration in the place of the one that it replaces, and runs that were not stored."""
+        known = {other[:3]: other for other in self.places}
+        self.places = list((known | {place[:3]: place}).values())
         self.runs += found
         if self.runs:
             files.write(self.rows, rows.write(self.runs))
         _write_places(self.table, self.places)
 
     def group_of(self, place: Place) -> Group | None:
-        """Return the runs at a calibrated value, as one group."""
+        """Return the runs at a calibrated value, as one group.
+
+        If they differ in other settings, those with today's defaults count, or else the newest.
+        """
         here = [run for run in self.runs if (run.config.environment, run.config.algorithm) == place[:2]]
         same = [
             run
             for run in here
             if all(np.float32(get_value(run.config, name)) == np.float32(value) for name, value in place.settings.items())
         ]
-        return group(same)[-1] if same else None  # of different settings, the newest
+        if not same:
+            return None
+        groups, wanted = group(same), to_plain(place.config)
+        return next((one for one in groups if to_plain(one.config) == wanted), groups[-1])
 
 
 def _files(results: Path) -> tuple[Path, Path]:
@@ -186,8 +209,8 @@ def _write_places(table: Path, places: Sequence[Place]) -> None:
 
 
 def is_stored(results: Path) -> bool:
-    """Return whether a folder holds rows of a leaderboard."""
-    return _files(results)[1].exists()
+    """Return whether a folder holds anything of a leaderboard."""
+    return any(path.exists() for path in _files(results))
 
 
 def remove(results: Path, algorithms: Sequence[str]) -> None:
@@ -202,7 +225,8 @@ def remove(results: Path, algorithms: Sequence[str]) -> None:
     for algorithm in algorithms:
         if algorithm not in known:
             raise ValueError(f"nothing is stored of {algorithm!r}; there is {', '.join(known) or 'no rule'}")
-    rows.drop(runs, algorithms)
+    if runs.exists():
+        rows.drop(runs, algorithms)
     _write_places(table, [place for place in places if place.algorithm not in algorithms])
 
 
@@ -255,9 +279,46 @@ def _obstacle(environment: str, algorithm: str) -> str:
     return ""
 
 
-def compete(store: Store, entry: Entry) -> None:
-    """Calibrate a rule and run it, but for what is stored; store each run when it is finished."""
-    fixed = Place(*entry[:3], "", 0.0, 0.0, solved=False)
+def compete(store: Store, asked: Sequence[Entry]) -> list[str]:
+    """Calibrate rules and run them, one after the other, but for what is stored. If one fails, the others still run.
+
+    Args:
+        store: to which each run is added when it is finished.
+        asked: what is to be compared.
+
+    Returns:
+        Names of those that failed.
+
+    Raises:
+        ValueError: before anything is computed, if what is stored of these environments was run with other settings.
+    """
+    _check_alike(store, {entry.environment for entry in asked})
+    failed = []
+    for entry in asked:
+        try:
+            _compete(store, entry)
+        except (ValueError, Diverged) as error:
+            say(f"{entry.name} failed: {error}")
+            failed.append(entry.name)
+    return failed
+
+
+def _check_alike(store: Store, environments: Collection[str]) -> None:
+    """Check that what is stored has the settings that new runs would have; else they could not be compared."""
+    for place in store.places:
+        found = store.group_of(place) if place.environment in environments else None
+        if found is None:
+            continue
+        difference = folder.first_difference(folder.Run(Path(), place.config, 0), folder.Run(Path(), found.config, 0))
+        if difference:
+            raise ValueError(
+                f"the stored runs of {place.algorithm} on {place.environment} have other settings ({difference}): "
+                f"forget them with `fleetjax leaderboard remove {place.algorithm}`, or choose another --results"
+            )
+
+
+def _compete(store: Store, entry: Entry) -> None:
+    fixed = Place(*entry[:3], "", 0.0, None, solved=False)
     place = fixed if entry.algorithm in FIXED else store.find(*entry[:3]) or tune(entry)
     store.add(place)
     name = "-".join(f"{field}-{np.float32(value)!s}" for field, value in place.settings.items()) or "as-it-is"
@@ -265,8 +326,8 @@ def compete(store: Store, entry: Entry) -> None:
     known = {folder.name_of(run) for run in store.runs}
     stored = sum(folder.name_of(folder.Run(Path(), config, seed)) in known for seed in range(entry.seeds))
     if stored:
-        where = f"{text.label(entry.algorithm)} on {entry.environment} at {entry.budget:,} human timesteps"
-        say(f"{where}: {text.plural(stored, 'run')} already stored, and not repeated")
+        remedy = f"if the rule has changed, first `fleetjax leaderboard remove {entry.algorithm}`"
+        say(f"{entry.name}: {text.plural(stored, 'run')} already stored, and not repeated ({remedy})")
     for seed in range(entry.seeds):
         run = folder.Run(entry.folder / f"{name}-seed{seed}", config, seed)
         if folder.name_of(run) not in known:

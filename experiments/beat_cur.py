@@ -90,7 +90,8 @@ def make(variant: Variant, config: Any) -> Priority:
             "held": chance + (signals.helped & (signals.help_time < HOLD)),
         }
         chosen = jnp.where(signals.violation | (t >= until), 0.0, values[variant.choice] + 1e-6)
-        late = jnp.where((t >= until) & (signals.uncertainty >= variant.late), signals.uncertainty, 0.0)
+        asks = (t >= until) & (signals.uncertainty >= variant.late) & ~signals.violation
+        late = jnp.where(asks, signals.uncertainty, 0.0)
         begins = {"first": 0.0, "last": jnp.inf, "half": until / 2}[variant.resets]
         first, last = signals.violation & (t >= begins), signals.violation & (variant.resets == "last")
         return lexicographic(first, chosen + late, last)

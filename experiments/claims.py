@@ -225,8 +225,8 @@ class Study:
     """
 
     def __init__(self, folder: Path):
-        paths = sorted(folder.glob(f"*{rows.SUFFIX}"))
-        self._runs = {path.stem: [(to_plain(run.config), run) for run in rows.read(path)] for path in paths}
+        self._folder = folder
+        self._runs: dict[str, list[tuple[dict[str, Any], Outcome]]] = {}
 
     def values(self, part: str, setting: Setting, measure: Measure) -> dict[int, float]:
         """Return a measure of the runs of a part that have a setting, by seed.
@@ -234,7 +234,10 @@ class Study:
         Raises:
             ValueError: if two have the same seed.
         """
-        found = [run for fields, run in self._runs.get(part, ()) if setting.items() <= fields.items()]
+        if part not in self._runs:
+            path = self._folder / f"{part}{rows.SUFFIX}"
+            self._runs[part] = [(to_plain(run.config), run) for run in rows.read(path)] if path.exists() else []
+        found = [run for fields, run in self._runs[part] if setting.items() <= fields.items()]
         files.expect(len({run.seed for run in found}) == len(found), f"{part} has a seed of {dict(setting)} twice")
         return {run.seed: measure(run) for run in found}
 

@@ -98,10 +98,12 @@ def missing(args: argparse.Namespace) -> str:
     for name in paper.PARTS:
         stored = paper.Part(name, args).rows()
         plans = plan(paper.Part(paper.TRAINED if name == "policies" else name, args).study())
+        planned = {folder.name_of(run) for run in plans}
+        stored = {key: run for key, run in stored.items() if key in planned}  # none of older settings
         table.append((name, *counts(stored, len(plans)), f"`python experiments/paper.py {name}`"))
         kind = "policy " if name == "policies" else ""  # which is not the run that trained it
         every |= {kind + key: run for key, run in stored.items()}
-        wanted |= {kind + folder.name_of(run) for run in plans}
+        wanted |= {kind + key for key in planned}
     return text.markdown_table([*table, ("all, each once", *counts(every, len(wanted)), "`python experiments/paper.py`")])
 
 
@@ -132,7 +134,8 @@ def against_cur(found: list[Group], early: Sequence[Group] = ()) -> str:
         for one, how in (*usual, *others, *ceiling):
             values = comparing.values_by_seed(one, "successes")
             shared = sorted(values.keys() & reference.keys())
-            ratio = sum(values[seed] for seed in shared) / sum(reference[seed] for seed in shared) if shared else None
+            base = sum(reference[seed] for seed in shared)
+            ratio = sum(values[seed] for seed in shared) / base if base else None
             cells = [f"{claims.NAMES[place]}, {text.label(one.config.algorithm)}{how}", str(len(values))]
             cells += [comparing.interval(comparing.values(one, "successes"))]
             cells += ["" if one is here.get("cur") or ratio is None else f"{ratio:.2f}"]

@@ -18,7 +18,7 @@ import paper
 
 from fleetjax import statistics
 from fleetjax.config import Config, get_value
-from fleetjax.field import FIELDS, OF_HUMANS
+from fleetjax.field import FIELDS, OF_HUMANS, OF_LINKS
 from fleetjax.io import comparing, figure, files, scripts, sweep, text
 from fleetjax.io.outcomes import Group, group
 
@@ -42,18 +42,18 @@ PERFECT = Circumstance("", "perfect people")
 
 def circumstance(config: Config) -> Circumstance:
     """Return what is imperfect in a run."""
-    changed = {name: float(get_value(config, name)) for name in OF_HUMANS if _differs(config, name)}
+    changed = {
+        name: f"{float(get_value(config, name)):g}"
+        for name in (*OF_LINKS, *OF_HUMANS)
+        if np.float32(get_value(config, name)) != np.float32(FIELDS[name].default)
+    }
     if config.link_model != "perfect":
-        return Circumstance("link_model", config.link_model)
+        changed = {"link_model": config.link_model} | changed
     if not changed:
         return PERFECT
     name = next((name for name in changed if name != "takeover_time"), "takeover_time")
-    besides = "".join(f", {other} {value:g}" for other, value in changed.items() if other != name)
-    return Circumstance(name, f"{changed[name]:g}{besides}")
-
-
-def _differs(config: Config, name: str) -> bool:
-    return float(get_value(config, name)) != FIELDS[name].default
+    besides = "".join(f", {other} {value}" for other, value in changed.items() if other != name)
+    return Circumstance(name, f"{changed[name]}{besides}")
 
 
 def table(groups: Sequence[Group]) -> str:
@@ -66,23 +66,28 @@ def table(groups: Sequence[Group]) -> str:
         rows.append((place.name.replace("_", " "), place.level.replace("_", " "), *cells))
     note = (
         "Each cell: mean successes (95 % interval; with fewer than 5 seeds, smallest to largest), the percentage of what the "
+        "same rule has with perfect people (over the seeds that both have), and mean human timesteps."
     )
-    note += "same rule has with perfect people, and mean human timesteps."
     return f"{text.markdown_table(rows)}\n\n{note}\n"
 
 
-def _find(groups: Sequence[Group], rule: str, place: Circumstance, metric: str = "successes") -> np.ndarray:
-    """Return a metric of a rule in a circumstance, of each seed; empty if there are none. Older settings stand behind."""
+def _find(groups: Sequence[Group], rule: str, place: Circumstance, metric: str = "successes") -> dict[int, float]:
+    """Return a metric of a rule in a circumstance, by seed; empty if there are none. Older settings stand behind."""
     found = [one for one in groups if one.config.algorithm == rule and circumstance(one.config) == place]
-    return comparing.values(found[0], metric) if found else np.array([])
+    return comparing.values_by_seed(found[0], metric) if found else {}
 
 
 def _cell(groups: Sequence[Group], rule: str, place: Circumstance) -> str:
     values, perfect = (_find(groups, rule, where) for where in (place, PERFECT))
-    if not len(values):
+    if not values:
         return ""
-    share = f", {100 * values.mean() / perfect.mean():.0f} %" if place.name and perfect.sum() else ""
-    return f"{comparing.interval(values)}{share}; {text.number(_find(groups, rule, place, 'human_steps').mean())}"
+    most = max(len(one.runs) for one in groups)
+    seeds = f" ({text.plural(len(values), 'seed')})" if len(values) < most else ""
+    spent = text.number(float(np.mean(list(_find(groups, rule, place, "human_steps").values()))))
+    shared = values.keys() & perfect.keys()
+    whole = sum(perfect[seed] for seed in shared)
+    share = f", {100 * sum(values[seed] for seed in shared) / whole:.0f} %" if place.name and whole else ""
+    return f"{comparing.interval(np.array(list(values.values())))}{seeds}{share}; {spent}"
 
 
 def draw(groups: Sequence[Group]) -> bytes:
@@ -119,7 +124,8 @@ def _without(place: Circumstance, places: Sequence[Circumstance]) -> Circumstanc
 def _panel(ax: Any, groups: Sequence[Group], rules: Sequence[str], places: Sequence[Circumstance]) -> None:
     """Draw a panel: people without the imperfection at the left, then one level after the other."""
     for rule in rules:
-        found = [(i, values) for i, place in enumerate(places) if len(values := _find(groups, rule, place))]
+        every = [np.array(list(_find(groups, rule, place).values())) for place in places]
+        found = [(i, values) for i, values in enumerate(every) if len(values)]
         if not found:
             continue
         middle = np.array([values.mean() for _, values in found])

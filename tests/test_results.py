@@ -7,16 +7,20 @@ import sys
 from pathlib import Path
 
 import claims
+import numpy as np
 import page
 import paper
+import people
 import pytest
 from commands import make_metrics
 
 import fleetjax
-from fleetjax.io import rows, sources
+from fleetjax.io import leaderboard, rows, sources, standings
+from fleetjax.io.outcomes import group
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "experiments" / "results"
+IMPERFECT = [f"people_{name}" for name in people.ENVIRONMENTS]
 PARTS = [name for name in paper.PARTS if (RESULTS / f"{name}.csv").exists()]
 
 
@@ -39,7 +43,31 @@ def test_tables_are_those_of_the_rows(part, remade):
         assert (remade / f"{part}.png").stat().st_size > 10_000
 
 
-@pytest.mark.parametrize("part", PARTS)
+@pytest.mark.slow
+def test_the_table_of_the_leaderboard_is_that_of_its_rows():
+    assert standings.table(leaderboard.Store(RESULTS)) == (RESULTS / "leaderboard.md").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", IMPERFECT)
+def test_tables_of_imperfect_people_are_those_of_their_rows(part):
+    assert people.table(page.groups(RESULTS, part)) == (RESULTS / f"{part}.md").read_text()
+
+
+def test_shares_are_over_the_seeds_that_both_have():
+    """The rule keeps half of its successes, seed by seed; a seed that only perfect people have makes no difference."""
+    runs = []
+    for seed in range(5):
+        config = fleetjax.make_config("navigation", "cur", num_steps=40)
+        metrics = make_metrics(0, 40)._replace(successes=np.full(40, 10 * (seed + 1)))
+        runs.append((config, seed, metrics))
+        if seed < 3:
+            runs.append((config.replace(action_noise=0.5), seed, metrics._replace(successes=metrics.successes // 2)))
+    (line,) = [line for line in people.table(group(sources.collect(runs))).splitlines() if "action noise" in line]
+    assert "400 (200 to 600) (3 seeds), 50 %;" in line
+
+
+@pytest.mark.parametrize("part", [*PARTS, *IMPERFECT, "leaderboard"])
 def test_rows_are_those_of_whole_runs(part):
     for run in rows.read(RESULTS / f"{part}.csv"):
         assert run.timesteps[-1] == run.config.num_steps

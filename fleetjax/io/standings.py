@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 
 from fleetjax.io import comparing, files, text
-from fleetjax.io.leaderboard import Place, Store
+from fleetjax.io.leaderboard import BUDGETS, Place, Store
 from fleetjax.io.outcomes import Group
 from fleetjax.statistics import mean_bounds
 
 MISSED = 0.1  # relative difference of the mean human time from the budget above which a rule is marked
+NOTE = "In parentheses: 95 % intervals (BCa bootstrap over seeds); with fewer than five seeds, the smallest and the largest."
 COLOURS = ("#56B4E9", "#0072B2", "#D55E00")  # of budgets, from the smallest
 
 
@@ -32,11 +33,12 @@ def publish(store: Store) -> Path:
 def table(store: Store) -> str:
     """Return the table of every environment and budget, the most successes first."""
     parts = []
-    for environment in dict.fromkeys(place.environment for place in store.places):
+    known = {place.environment for place in store.places}
+    for environment in (name for name in BUDGETS if name in known):
         for budget in sorted({place.budget for place in store.places if place.environment == environment}):
             here = [place for place in store.places if place.environment == environment and place.budget == budget]
             parts.append(f"## {environment}, {budget:,} human timesteps\n\n{_part(store, here)}")
-    return "\n\n".join(parts) + "\n"
+    return "\n\n".join([*parts, NOTE]) + "\n"
 
 
 def _part(store: Store, places: list[Place]) -> str:
@@ -63,7 +65,7 @@ def _difference(one: Group, reference: Group | None) -> str:
         return ""
     mine, others = (comparing.values_by_seed(each, "successes") for each in (one, reference))
     shared = sorted(mine.keys() & others.keys())
-    return comparing.interval(np.array([mine[seed] - others[seed] for seed in shared])) if shared else ""
+    return comparing.interval(np.array([mine[seed] - others[seed] for seed in shared])) if len(shared) > 1 else ""
 
 
 def _human_time(one: Group) -> float:
@@ -85,10 +87,11 @@ def draw(store: Store) -> bytes:
 
     from fleetjax.io import figure  # imported on demand
 
-    panels: dict[str, list[tuple[Place, Group]]] = {}
+    panels: dict[str, list[tuple[Place, Group]]] = {name: [] for name in BUDGETS}
     for place in store.places:
         if one := store.group_of(place):
-            panels.setdefault(place.environment, []).append((place, one))
+            panels[place.environment].append((place, one))
+    panels = {name: found for name, found in panels.items() if found}
     rules = {name: len({place.algorithm for place, _ in found}) for name, found in panels.items()}
     few = [name for name in panels if 2 * rules[name] < max(rules.values())]
     lines = [line for line in ([name for name in panels if name not in few], few) if line]

@@ -49,15 +49,15 @@ def test_the_same_command_answers_from_what_it_ran(solved, capsys):
     assert capsys.readouterr().out.startswith("random_threshold = 0.9")
 
 
-def calibrated(tmp_path, monkeypatch, human_time, **options):
-    """Calibrate Random where a run spends `human_time(threshold, seed)`; return what was found and the runs that it took."""
+def calibrated(tmp_path, monkeypatch, spends, **options):
+    """Calibrate Random where a run spends `spends(threshold, seed)`; return what was found and the runs that it took."""
     config = fleetjax.make_config("navigation", "random")
     request = calibration.Request(config, "random_threshold", 1000.0, (0, 1, 2), 0.1, 5, tmp_path)._replace(**options)
     runs = []
 
     def spend(request, value, seed):
         runs.append((value, seed))
-        return float(human_time(value, seed))
+        return float(spends(value, seed))
 
     monkeypatch.setattr(calibration, "_human_time", spend)
     return calibration.calibrate(request), runs
@@ -77,6 +77,14 @@ def test_a_first_value_that_is_near_enough_for_one_seed_alone_is_corrected(tmp_p
     found, _ = calibrated(tmp_path, monkeypatch, lambda x, seed: 2e4 * (1 - x) * (2 if seed else 1), config=config)
     assert found.solved
     assert found.value == pytest.approx(0.97, abs=0.005)
+
+
+def test_no_uncertainty_above_the_largest_entropy_is_tried(tmp_path, monkeypatch):
+    config = fleetjax.make_config("block_push", "cur")
+    options = {"config": config, "field": "uncertainty_threshold", "human_time": 50.0}
+    found, runs = calibrated(tmp_path, monkeypatch, lambda x, seed: 400 if x < 1 else 90, **options)
+    assert found.value == max(value for value, _ in runs) == pytest.approx(math.log(4))
+    assert not found.solved
 
 
 def test_of_values_with_all_seeds_the_nearest_is_taken(tmp_path, monkeypatch):

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fleetjax import envs
 from fleetjax.config import Config, all_fields, check_one_for_all, get_value, validate
 from fleetjax.io import files, folder, resumable, text
 from fleetjax.io.progress import say
@@ -105,8 +106,7 @@ def calibrate(request: Request) -> Calibration:
     Runs that `output` holds already are not repeated.
     """
     field = all_fields(request.config.algorithm)[request.field]
-    most = math.inf if field.high is None else field.high
-    scale = Scale(field.high == 1, field.low or 0.0, most, rises=request.field.endswith(("_rate", "_time")))
+    scale = Scale(field.high == 1, field.low or 0.0, _largest(request), rises=request.field.endswith(("_rate", "_time")))
     spend = functools.cache(functools.partial(_human_time, request))
 
     def search(seeds: tuple[int, ...], start: float, step: float = FIRST_STEP) -> list[tuple[float, float]]:
@@ -131,6 +131,15 @@ def calibrate(request: Request) -> Calibration:
         content["error"] = None  # JSON has no NaN
     files.write_json(request.output / FILE, content | {"versions": folder.versions()})
     return found
+
+
+def _largest(request: Request) -> float:
+    """Return the largest value that makes a difference."""
+    spec = envs.make(request.config.environment, request.config.backend).spec
+    if request.field == "uncertainty_threshold" and spec.discrete:
+        return math.log(spec.action_size)  # the largest entropy of so many actions
+    high = all_fields(request.config.algorithm)[request.field].high
+    return math.inf if high is None else high
 
 
 def _stored(value: float) -> float:

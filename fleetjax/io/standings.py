@@ -126,4 +126,4 @@ def _panel(ax: Any, environment: str, found: list[tuple[Place, Group]]) -> None:
     ax.grid(axis="y", alpha=0.3)
     ax.set(title=environment, xlabel="successes", ylim=(-0.7, len(rules) - 0.3))
     ax.set_xlim(left=0)
-    ax.legend(title="human timesteps\n(hollow: missed)", loc="lower right")
+    ax.legend(title="human timesteps\n(hollow: missed)", loc="best")

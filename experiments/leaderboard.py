@@ -12,6 +12,7 @@ import argparse
 from pathlib import Path
 
 import fleetjax
+from fleetjax.field import ORDERS
 from fleetjax.io import files, leaderboard, scripts, standings
 from fleetjax.io.lists import listed
 
@@ -20,7 +21,8 @@ FIRST = ("cur", "random", "teach_first", "ensemble_dagger", "round_robin")  # to
 
 def every_rule() -> list[str]:
     """Return the names of all rules but orders of letters and expert, in the order in which they are run."""
-    rules = [name for name in fleetjax.list_algorithms() if name == "cur" or (name != "expert" and set(name) - set("cur"))]
+    left_out = {"expert", *ORDERS} - {"cur"}
+    rules = [name for name in fleetjax.list_algorithms() if name not in left_out]
     return sorted(rules, key=lambda name: FIRST.index(name) if name in FIRST else len(FIRST))
 
 

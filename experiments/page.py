@@ -127,18 +127,14 @@ def against_cur(found: list[Group], early: Sequence[Group] = ()) -> str:
         for one in found:
             if one.config.environment == place:
                 here.setdefault(one.config.algorithm, one)  # those of the study come before older ones
-        reference = comparing.values_by_seed(here["cur"], "successes") if "cur" in here else {}
+        reference = here.get("cur")
         usual = [(here[algorithm], "") for algorithm in ("cur", "random", "teach_first") if algorithm in here]
         others = [(one, ", trained early") for one in early if one.config.environment == place]
         ceiling = [(one, "") for algorithm, one in here.items() if algorithm == "expert"]
         for one, how in (*usual, *others, *ceiling):
-            values = comparing.values_by_seed(one, "successes")
-            shared = sorted(values.keys() & reference.keys())
-            base = sum(reference[seed] for seed in shared)
-            ratio = sum(values[seed] for seed in shared) / base if base else None
-            cells = [f"{claims.NAMES[place]}, {text.label(one.config.algorithm)}{how}", str(len(values))]
-            cells += [comparing.interval(comparing.values(one, "successes"))]
-            cells += ["" if one is here.get("cur") or ratio is None else f"{ratio:.2f}"]
+            ratio = comparing.ratio(one, reference, "successes") if reference and one is not reference else None
+            cells = [f"{claims.NAMES[place]}, {text.label(one.config.algorithm)}{how}", str(len(one.runs))]
+            cells += [comparing.interval(comparing.values(one, "successes")), "" if ratio is None else f"{ratio:.2f}"]
             table.append((*cells, *(mean(one, metric) for metric in ("violations", "human_steps", "idle"))))
     return text.markdown_table(table)
 

@@ -71,23 +71,21 @@ def table(groups: Sequence[Group]) -> str:
     return f"{text.markdown_table(rows)}\n\n{note}\n"
 
 
-def _find(groups: Sequence[Group], rule: str, place: Circumstance, metric: str = "successes") -> dict[int, float]:
-    """Return a metric of a rule in a circumstance, by seed; empty if there are none. Older settings stand behind."""
-    found = [one for one in groups if one.config.algorithm == rule and circumstance(one.config) == place]
-    return comparing.values_by_seed(found[0], metric) if found else {}
+def _find(groups: Sequence[Group], rule: str, place: Circumstance) -> Group | None:
+    """Return the runs of a rule in a circumstance, or None. Older settings stand behind."""
+    return next((one for one in groups if one.config.algorithm == rule and circumstance(one.config) == place), None)
 
 
 def _cell(groups: Sequence[Group], rule: str, place: Circumstance) -> str:
-    values, perfect = (_find(groups, rule, where) for where in (place, PERFECT))
-    if not values:
+    found, perfect = (_find(groups, rule, where) for where in (place, PERFECT))
+    if found is None:
         return ""
     most = max(len(one.runs) for one in groups)
-    seeds = f" ({text.plural(len(values), 'seed')})" if len(values) < most else ""
-    spent = text.number(float(np.mean(list(_find(groups, rule, place, "human_steps").values()))))
-    shared = values.keys() & perfect.keys()
-    whole = sum(perfect[seed] for seed in shared)
-    share = f", {100 * sum(values[seed] for seed in shared) / whole:.0f} %" if place.name and whole else ""
-    return f"{comparing.interval(np.array(list(values.values())))}{seeds}{share}; {spent}"
+    seeds = f" ({text.plural(len(found.runs), 'seed')})" if len(found.runs) < most else ""
+    ratio = comparing.ratio(found, perfect, "successes") if perfect and found is not perfect else None
+    share = "" if ratio is None else f", {100 * ratio:.0f} %"
+    spent = text.number(float(comparing.values(found, "human_steps").mean()))
+    return f"{comparing.interval(comparing.values(found, 'successes'))}{seeds}{share}; {spent}"
 
 
 def draw(groups: Sequence[Group]) -> bytes:
@@ -124,8 +122,8 @@ def _without(place: Circumstance, places: Sequence[Circumstance]) -> Circumstanc
 def _panel(ax: Any, groups: Sequence[Group], rules: Sequence[str], places: Sequence[Circumstance]) -> None:
     """Draw a panel: people without the imperfection at the left, then one level after the other."""
     for rule in rules:
-        every = [np.array(list(_find(groups, rule, place).values())) for place in places]
-        found = [(i, values) for i, values in enumerate(every) if len(values)]
+        every = [(i, _find(groups, rule, place)) for i, place in enumerate(places)]
+        found = [(i, comparing.values(one, "successes")) for i, one in every if one]
         if not found:
             continue
         middle = np.array([values.mean() for _, values in found])

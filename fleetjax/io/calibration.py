@@ -105,23 +105,21 @@ def calibrate(request: Request) -> Calibration:
 
     Runs that `output` holds already are not repeated.
     """
-    field = all_fields(request.config.algorithm)[request.field]
-    scale = Scale(field.high == 1, field.low or 0.0, _largest(request), rises=request.field.endswith(("_rate", "_time")))
-    spend = functools.cache(functools.partial(_human_time, request))
+    scale, spend = _scale(request), functools.cache(functools.partial(_human_time, request))
+
+    def mean(seeds: tuple[int, ...], value: float) -> float:
+        return float(np.mean([spend(_stored(value), seed) for seed in seeds]))
 
     def search(seeds: tuple[int, ...], start: float, step: float = FIRST_STEP) -> list[tuple[float, float]]:
-        def mean(value: float) -> float:
-            return float(np.mean([spend(_stored(value), seed) for seed in seeds]))
-
-        found = solve(mean, request.human_time, start, scale, tolerance=request.tolerance, most=request.most, step=step)
+        asked = functools.partial(mean, seeds)
+        found = solve(asked, request.human_time, start, scale, tolerance=request.tolerance, most=request.most, step=step)
         return [(_stored(value), spent) for value, spent in found]
 
     first = request.seeds[:1]
     tried = search(first, float(get_value(request.config, request.field)))
     value = _nearest(request, tried)
     if len(request.seeds) > 1:
-        spent = np.mean([spend(value, seed) for seed in request.seeds])
-        means = search(request.seeds, value, _step(request, value, float(spent), tried, scale))
+        means = search(request.seeds, value, _step(request, value, mean(request.seeds, value), tried, scale))
         tried += [(other, spend(other, *first)) for other, _ in means if other not in dict(tried)]
         value = _nearest(request, means)
     spent = tuple(spend(value, seed) for seed in request.seeds)
@@ -133,13 +131,14 @@ def calibrate(request: Request) -> Calibration:
     return found
 
 
-def _largest(request: Request) -> float:
-    """Return the largest value that makes a difference."""
+def _scale(request: Request) -> Scale:
+    """Return how the field is searched, up to the largest value that makes a difference."""
+    field = all_fields(request.config.algorithm)[request.field]
     spec = envs.make(request.config.environment, request.config.backend).spec
+    most = math.inf if field.high is None else field.high
     if request.field == "uncertainty_threshold" and spec.discrete:
-        return math.log(spec.action_size)  # the largest entropy of so many actions
-    high = all_fields(request.config.algorithm)[request.field].high
-    return math.inf if high is None else high
+        most = math.log(spec.action_size)  # the largest entropy of so many actions
+    return Scale(field.high == 1, field.low or 0.0, most, rises=request.field.endswith(("_rate", "_time")))
 
 
 def _stored(value: float) -> float:

@@ -137,6 +137,14 @@ def values_by_seed(one: Group, metric: str) -> dict[int, float]:
     return {seed: _value(run, metric) for seed, run in one.runs.items()}
 
 
+def ratio(one: Group, other: Group, metric: str) -> float | None:
+    """Return what a group achieved relative to another, over the seeds that both have; None if the other achieved nothing."""
+    mine, others = (values_by_seed(each, metric) for each in (one, other))
+    shared = mine.keys() & others.keys()
+    base = sum(others[seed] for seed in shared)
+    return sum(mine[seed] for seed in shared) / base if base else None
+
+
 def _value(run: Outcome, metric: str) -> float:
     """Return what a run achieved.
 

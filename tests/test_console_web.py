@@ -474,7 +474,7 @@ def open_page(browser, served, path: str, errors: list[str], **options):
 
 def mode(page, *wanted: str) -> str:
     """Wait until a seat is in one of some modes, and return it."""
-    page.wait_for_function("modes => modes.includes(document.getElementById('desk').dataset.mode)", arg=list(wanted))
+    page.wait_for_function("modes => modes.includes(document.getElementById('desk')?.dataset.mode)", arg=list(wanted))
     return page.get_attribute("#desk", "data-mode")
 
 

@@ -24,7 +24,7 @@ import people
 
 from fleetjax.io import comparing, files, folder, leaderboard, rows, standings, text
 from fleetjax.io.outcomes import Group, Outcome, group
-from fleetjax.io.study import plan
+from fleetjax.io.study import combine
 
 PUBLISHED = {  # successes of the trained policies (paper, Appendix); Fleet-TD is the hand's only
     "humanoid": {"constraint": 0, "random": 746.3, "ensemble_dagger": 617.7, "cur": 771.0, "expert": 894},
@@ -97,7 +97,7 @@ def missing(args: argparse.Namespace) -> str:
     wanted: set[str] = set()
     for name in paper.PARTS:
         stored = paper.Part(name, args).rows()
-        plans = plan(paper.Part(paper.TRAINED if name == "policies" else name, args).study())
+        plans = combine(paper.Part(paper.TRAINED if name == "policies" else name, args).study())
         planned = {folder.name_of(run) for run in plans}
         stored = {key: run for key, run in stored.items() if key in planned}  # none of older settings
         table.append((name, *counts(stored, len(plans)), f"`python experiments/paper.py {name}`"))

@@ -5,11 +5,9 @@ import signal
 from collections.abc import Iterator
 from pathlib import Path
 
+import compiling
 import hypothesis
 import pytest
-
-# Quick tests compile more than they compute: with these, XLA compiles a fleet in a quarter of the time.
-QUICK_FLAGS = "--xla_cpu_use_fusion_emitters=false"
 
 # Files that take longest. They begin first, so that the workers end at about the same time.
 LONGEST = (
@@ -44,8 +42,7 @@ hypothesis.settings.load_profile("fleetjax")
 def pytest_configure(config: pytest.Config) -> None:
     """Compile quickly where no slow test runs: in this process, in xdist's, and in those that tests start."""
     if config.option.markexpr == "not slow and not long":
-        os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK_FLAGS}".strip()
+        os.environ.update(compiling.environment())
     import jax  # only now, since it reads the environment
 
     jax.config.update("jax_numpy_dtype_promotion", "strict")

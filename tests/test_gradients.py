@@ -363,7 +363,7 @@ def test_samples_side_by_side_are_those_one_after_the_other(config, monkeypatch)
     assert gradients.chunk_size(config, fleetjax.envs.make("navigation")) == 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_estimate_of_memory_is_what_the_program_takes(config):
     soft, env = config.replace(allocation="soft", num_steps=64, human_capacity=300), fleetjax.envs.make("navigation")
     derive = gradients.make_gradient(soft, env, human_time, ("risk_threshold",), "relaxed", {}, 2)
@@ -381,7 +381,7 @@ def test_whole_numbers_can_be_smoothed(config):
     assert abs(found.gradient["min_teleop_time"] - 10) < 4 * found.standard_error["min_teleop_time"] < 10
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_relaxed_and_forward_gradients_agree(config):
     soft = config.replace(allocation="soft", temperature=0.5)
     fields = ("uncertainty_threshold", "risk_weight", "learning_rate")
@@ -489,7 +489,7 @@ def on_mjx():
     return fleetjax.make_config("humanoid", "weighted", **tiny)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_mjx_has_no_reverse_derivatives(on_mjx):
     assert "use method = 'forward' or 'smoothed'" in refused(on_mjx, method="relaxed")
 

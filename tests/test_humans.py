@@ -240,11 +240,11 @@ def test_who_is_there_and_what_they_do_are_drawn_apart(monkeypatch):
         found = humans.HUMAN_MODELS.get("imperfect")(config, spec)
 
         def available(aux, key):
-            keys["available"] = key
+            jax.debug.callback(lambda data: keys.update(available=data), jax.random.key_data(key))
             return found.available(aux, key)
 
         def act(aux, plan, action, key):
-            keys["act"] = key
+            jax.debug.callback(lambda data: keys.update(act=data), jax.random.key_data(key))
             return found.act(aux, plan, action, key)
 
         return found._replace(available=available, act=act)
@@ -252,9 +252,9 @@ def test_who_is_there_and_what_they_do_are_drawn_apart(monkeypatch):
     monkeypatch.setitem(humans.HUMAN_MODELS.entries, "watched", make)
     config = fleetjax.make_config("navigation", human_model="watched", **SMALL)
     state = compiled(fleetjax.prepare)(config, jax.random.key(0))
-    with jax.disable_jit():
-        make_fleet(config, envs.make("navigation")).step(state, jax.random.key(1))
-    assert not np.array_equal(*(jax.random.key_data(keys[part]) for part in ("available", "act")))
+    compiled(make_fleet(config, envs.make("navigation")).step)(state, jax.random.key(1))
+    jax.effects_barrier()
+    assert not np.array_equal(keys["available"], keys["act"])
 
 
 def test_fatigue_grows_with_work_and_lengthens_takeovers():

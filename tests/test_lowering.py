@@ -14,7 +14,10 @@ FLEET = {"num_robots": 4, "num_humans": 2, "num_steps": 20, "num_demonstrations"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("environment", envs.list_envs())
+@pytest.mark.parametrize(
+    "environment",
+    [pytest.param(x, marks=[pytest.mark.long] * (x in ("anymal", "allegro_hand"))) for x in envs.list_envs()],
+)
 def test_every_fleet_lowers_for_accelerators(environment):
     config = fleetjax.make_config(environment, "cur", **FLEET, backend="mjx")
     traced = jax.jit(fleetjax.run).trace(config, jax.random.key(0))

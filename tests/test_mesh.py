@@ -110,7 +110,7 @@ def test_a_part_of_a_ring_takes_the_rows_of_its_own_robots():
     ("algorithm", "environment"),
     [
         ("random", "navigation"),
-        pytest.param("cur", "navigation", marks=pytest.mark.slow),
+        pytest.param("cur", "navigation", marks=pytest.mark.long),
         pytest.param("cur", "humanoid", marks=pytest.mark.long),
     ],
 )
@@ -221,7 +221,7 @@ def test_a_run_of_humanoids_in_native_physics_agrees_in_what_does_not_round(algo
     np.testing.assert_allclose(alone.state.env.obs, divided.state.env.obs, rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.statistical
 def test_runs_agree_in_distribution():
     config, keys = small("cur", num_steps=200), jax.random.split(jax.random.key(2), 10)

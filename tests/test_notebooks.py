@@ -6,10 +6,12 @@ from pathlib import Path
 
 import nbformat
 import pytest
+from compiling import environment
 from nbclient import NotebookClient
 
 FOLDER = Path(__file__).parents[1] / "experiments" / "notebooks"
 NAMES = sorted(path.name for path in FOLDER.glob("*.ipynb"))
+LONG = "which_part_matters.ipynb"  # minutes even at a small size
 SMALL = {"NUM_STEPS": 12, "NUM_SEEDS": 2, "NUM_SAMPLES": 2, "TUNING_STEPS": 1, "FILM_STEPS": 6}  # of the cell `parameters`
 
 
@@ -48,10 +50,12 @@ def test_files_that_notebooks_link_to_exist(notebook):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("notebook", [pytest.param(x, marks=[pytest.mark.long] * (x == LONG)) for x in NAMES], indirect=True)
 def test_a_notebook_runs(notebook, tmp_path, monkeypatch):
     cell = parameters(notebook)
     cell.source = re.sub(r"^(\w+) = .*$", lambda found: f"{found[1]} = {SMALL[found[1]]}", cell.source, flags=re.MULTILINE)
-    monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+    for name, value in environment().items():
+        monkeypatch.setenv(name, value)
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path))
     for rows in FOLDER.glob("*.csv"):
         shutil.copy(rows, tmp_path)

@@ -20,7 +20,7 @@ from fleetjax.physics import mjx, native
 from fleetjax.physics.base import PhysicsState, check_backend, make_physics, resolve_backend
 
 BACKENDS = ("native", "mjx")
-QUICK = "anymal"  # MJX takes long to compile a robot, and this one least of all: the others are among the slow tests
+QUICK = "anymal"  # MJX takes long to compile a robot, and this one least of all: the others are among the long tests
 
 
 def test_a_model_of_ones_own_is_loaded_by_its_absolute_path(tmp_path):
@@ -37,7 +37,7 @@ each_robot = pytest.mark.parametrize("name", ROBOTS)
 each_robot_and_backend = pytest.mark.parametrize(
     ("name", "backend"),
     [
-        pytest.param(name, backend, marks=[pytest.mark.slow] if backend == "mjx" and name != QUICK else [])
+        pytest.param(name, backend, marks=[pytest.mark.long] if backend == "mjx" and name != QUICK else [])
         for name in ROBOTS
         for backend in BACKENDS
     ],
@@ -161,7 +161,7 @@ def act(name: str, backend: str, num_steps: int):
 
 @pytest.mark.statistical
 @pytest.mark.slow
-@each_robot
+@pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.long] * (x != "humanoid")) for x in ROBOTS])
 def test_robots_violate_as_often_on_both_backends(name):
     """Share of violations within 200 steps, and steps before them: they differ by less than four standard errors."""
     one, other = (act(name, backend, 200) for backend in BACKENDS)

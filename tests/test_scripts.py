@@ -13,6 +13,7 @@ from typing import NamedTuple
 import paper
 import pytest
 from commands import TINY, make_metrics, write_run
+from compiling import environment
 
 import fleetjax
 from fleetjax.io import rows, scripts, sources
@@ -36,7 +37,7 @@ class Case(NamedTuple):
         prints: regular expressions, each of which is found in what it prints, line by line.
         writes: files that are there afterwards.
         prepare: what is called with the working folder before.
-        pace: None if it is done in about 15 s; else "slow", or "long" if it takes a minute or more.
+        pace: None if it is done in about 15 s; "slow" if users rely on it; else "long".
     """
 
     commands: tuple[str, ...]
@@ -138,21 +139,27 @@ CASES = {
     "benchmarks/profile_step.py": Case(
         (f"navigation --steps 2 --repeats 1 --trace trace -- {FLEET}",),
         (row("navigation", r"\w+", r"\d+", *[r"\d+\.\d\d"] * 8),),
+        pace="long",
     ),
     "benchmarks/scaling.py": Case(
         ("--environments navigation --num-robots 2 --num-seeds 1 --largest-navigation 10",),
         (row("navigation", "10", r"[\d.]+"), row("2", "1", r"[\d.]+", "1.00"), row("x10", r"[\d.]+"), row("navigation", "1")),
+        pace="long",
     ),
     "benchmarks/soak.py": Case(
         (f"--kills 1 --checkpoint-every 20 -- {FLEET} --num-steps 1000",),
         (r"^\d+ rounds, [1-9]\d* kills survived, \d+ starts from t > 0, \d+ timesteps lost in all$", "^results differing: 0$"),
+        pace="long",
     ),
     "benchmarks/startup.py": Case(
-        (f"--environments navigation --run-steps 4 -- {FLEET}",), (row("navigation", *[r"\d+\.\d+"] * 4),)
+        (f"--environments navigation --run-steps 4 -- {FLEET}",),
+        (row("navigation", *[r"\d+\.\d+"] * 4),),
+        pace="long",
     ),
     "benchmarks/sweep.py": Case(
         (f"--seeds 2 -- {FLEET} --algorithm constraint --extra-demonstrations 0 --num-steps 4",),
         (row("1", r"\d+", r"[\d.]+", r"[\d.]+", "1.00"), row(r"\d+", "1", r"[\d.]+", r"[\d.]+", r"[\d.]+")),
+        pace="long",
     ),
     "experiments/beat_cur.py": Case(
         (
@@ -160,6 +167,7 @@ CASES = {
             f"humanoid --variants teach-oldest -- {FLEET} --teaching-time 4",
         ),
         tuple(row("humanoid", name, *[r"\d+"] * 4) for name in ("random-half", "risk-last", "teach-oldest")),
+        pace="long",
     ),
     "experiments/claims.py": Case(
         ("--results rows", "--results rows --output claims.md"),
@@ -175,6 +183,7 @@ CASES = {
     "experiments/clone_error.py": Case(
         ("humanoid --demonstrations 256 --fresh 100 --gradient-steps 2",),
         (row("observation", "256", *[r"\d\.\d{4}"] * 3, r"\d+"), r"variance of the expert's actions \| +\| 0\.\d+"),
+        pace="long",
     ),
     "experiments/gradient_check.py": Case(
         (f"--seeds 1 --num-samples 2 --fresh 2 --lengths 4 --differences 4 --output check.png -- {FLEET} --num-steps 4",),
@@ -186,6 +195,7 @@ CASES = {
             row("4", r"[\d.e+-]+", r"[\d.e+-]+"),
         ),
         ("check.png",),
+        pace="long",
     ),
     "experiments/human_time.py": Case(
         ("run-0 run-1",),
@@ -223,6 +233,7 @@ CASES = {
         ),
         ("rows/main.csv", "rows/main.md", "rows/main.png", "rows/policies.csv", "again/policies.csv", "runs/main/sweep.json"),
         lambda place: (place / "main.toml").write_text(TINY_STUDY) and None,
+        pace="long",
     ),
     "experiments/people.py": Case(
         (
@@ -252,6 +263,7 @@ CASES = {
             r"^grid: 3 points, the best with a mean of [\d.]+$",
             row("best of the grid", *[r"[\d.]+"] * 6, r"-?[\d.]+", r"-?[\d.]+ to -?[\d.]+"),
         ),
+        pace="long",
     ),
     "experiments/which_part.py": Case(
         (
@@ -264,6 +276,7 @@ CASES = {
             row("navigation", "uncertainty", *[r"[-\d.]+ \([-\d.]+ to [-\d.]+\)"] * 3),
         ),
         ("rows.csv",),
+        pace="long",
     ),
 }
 
@@ -288,8 +301,8 @@ def test_a_script_runs_and_gives_what_it_should(script, tmp_path):
     case.prepare(tmp_path)
     for arguments in case.commands:
         command = [sys.executable, ROOT / script, *shlex.split(arguments)]
-        quick = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
-        done = subprocess.run(command, cwd=tmp_path, env=os.environ | quick, capture_output=True, text=True, check=False)
+        quick = os.environ | environment()
+        done = subprocess.run(command, cwd=tmp_path, env=quick, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
         printed += done.stdout
     for pattern in case.prints:

@@ -253,10 +253,24 @@ class _Planned(NamedTuple):
 
 
 def plan(study: Study) -> list[folder.Run]:
+    """Return what `combine` does, after a check that all of it can run here. The check traces each program.
+
+    Raises:
+        ValueError: as `combine`, and if a combination cannot be run.
+    """
+    runs = combine(study)
+    for run in {program((run,)): run for run in reversed(runs)}.values():
+        with _naming(run.folder.name):
+            folder.check_config(run.config)
+            check_plan(run.config, copies=study.seeds_per_program)
+    return runs
+
+
+def combine(study: Study) -> list[folder.Run]:
     """Return the runs of a sweep, with their folders.
 
     Raises:
-        ValueError: if a combination cannot be run, two are the same, or a parameter belongs to no algorithm of the sweep.
+        ValueError: if a combination is not valid, two are the same, or a parameter belongs to no algorithm of the sweep.
     """
     _check_used(study.blocks)
     planned = [run for block in study.blocks for run in _product(block)]
@@ -266,10 +280,6 @@ def plan(study: Study) -> list[folder.Run]:
     for same in (identities, [str(run.folder) for run in runs]):
         twice = collections.Counter(same).most_common(1)[0]
         expect(twice[1] == 1, f"{runs[same.index(twice[0])].folder.name} is in the sweep twice; omit one")
-    for run in {program((run,)): run for run in reversed(runs)}.values():
-        with _naming(run.folder.name):
-            folder.check_config(run.config)
-            check_plan(run.config, copies=study.seeds_per_program)
     return runs
 
 

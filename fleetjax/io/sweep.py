@@ -16,7 +16,7 @@ from fleetjax.io import cluster, crew, files, folder, metrics_csv, resumable, te
 from fleetjax.io.errors import Incomplete
 from fleetjax.io.job import LOGS
 from fleetjax.io.progress import progress_of_many, say
-from fleetjax.io.study import Group, Study, groups, plan
+from fleetjax.io.study import Group, Study, combine, groups
 
 FILE = "sweep.json"
 
@@ -43,7 +43,7 @@ def check_folder(study: Study, runs: Sequence[folder.Run]) -> None:
         "would round differently; choose another --output",
     )
     here = {run.folder: run for run in runs}
-    for run in plan(held):
+    for run in combine(held):
         files.expect(
             run.folder in here,
             f"{path} holds another sweep, with a run {run.folder.name} that this one lacks; choose another --output",
@@ -52,7 +52,7 @@ def check_folder(study: Study, runs: Sequence[folder.Run]) -> None:
         files.expect(not difference, f"{run.folder.name}: {difference} in {path}; choose another --output")
     theirs, ours = (
         {frozenset(run.folder for run in group) for group in groups(each, study.seeds_per_program)}
-        for each in (plan(held), runs)
+        for each in (combine(held), runs)
     )
     files.expect(
         theirs <= ours,
@@ -75,7 +75,7 @@ def _read(study: Study) -> Study:
             logged=content["log_interventions"],
             seeds_per_program=content.get("seeds_per_program", 1),
         )
-        plan(found)
+        combine(found)
         return found
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise ValueError(f"{path} cannot be used: {files.one_line(error)}; choose another --output") from None

@@ -21,7 +21,7 @@ from fleetjax import compare, evaluate, plot
 from fleetjax.io import comparing, figure, files, folder, rows, scripts, sweep
 from fleetjax.io.outcomes import Outcome, group
 from fleetjax.io.sources import collect
-from fleetjax.io.study import Study, make_study, plan
+from fleetjax.io.study import Study, combine, make_study, plan
 from fleetjax.priority import get_algorithm
 
 HERE = Path(__file__).parent
@@ -76,9 +76,9 @@ class Part:
             self.store(known[name] for name in wanted if name in known)
 
     def complete(self, runs: list[folder.Run]) -> None:
-        """Complete runs of this part in their folders."""
+        """Complete runs of this part, which `plan` has checked, in their folders."""
         study = self.study()
-        sweep.check_folder(study, plan(study))
+        sweep.check_folder(study, combine(study))
         if runs:
             sweep.run_all(study, runs)
 

@@ -42,8 +42,8 @@ def check_folder(study: Study, runs: Sequence[folder.Run]) -> None:
         f"seeds_per_program = {study.seeds_per_program}, but the sweep in {path} has {held.seeds_per_program}, and its runs "
         "would round differently; choose another --output",
     )
-    here = {run.folder: run for run in runs}
-    for run in combine(held):
+    here, before = {run.folder: run for run in runs}, combine(held)
+    for run in before:
         files.expect(
             run.folder in here,
             f"{path} holds another sweep, with a run {run.folder.name} that this one lacks; choose another --output",
@@ -51,8 +51,7 @@ def check_folder(study: Study, runs: Sequence[folder.Run]) -> None:
         difference = folder.first_difference(here[run.folder], run)
         files.expect(not difference, f"{run.folder.name}: {difference} in {path}; choose another --output")
     theirs, ours = (
-        {frozenset(run.folder for run in group) for group in groups(each, study.seeds_per_program)}
-        for each in (combine(held), runs)
+        {frozenset(run.folder for run in group) for group in groups(each, study.seeds_per_program)} for each in (before, runs)
     )
     files.expect(
         theirs <= ours,

@@ -154,7 +154,7 @@ ORDERS = tuple("".join(letters) for size in (3, 2, 1) for letters in itertools.p
 ORDERS_WITH_C = tuple(letters for letters in ORDERS if "c" in letters)
 _IDLE = Field("in the initial period, free humans teleoperate random robots", kind=bool, high=None, default=False)
 
-_TAU = Field("mean squared difference of actions that counts as a discrepancy (lazy_dagger: 0.032)", default=0.0025)
+_TAU = Field("mean squared difference of actions above which they count as a discrepancy (lazy_dagger: 0.032)", default=0.0025)
 
 # The parameters that an algorithm has besides, by its name. `register_algorithm` adds those of others.
 PARAMETERS: dict[str, Mapping[str, Field]] = {
@@ -184,7 +184,7 @@ PARAMETERS: dict[str, Mapping[str, Field]] = {
     },
     "lazy_dagger": {
         "lazy_threshold": Field("chance of a discrepancy below which no robot asks", high=1, default=0.5),
-        "discrepancy_tau": _TAU,
+        "discrepancy_tau": _TAU._replace(default=0.032),
         "lazy_handback": Field("discrepancy at which a human hands back, as a share of discrepancy_tau", default=0.25),
     },
     "dropout_dagger": {
@@ -234,8 +234,14 @@ PARAMETERS: dict[str, Mapping[str, Field]] = {
 
 
 def every_field() -> dict[str, Field]:
-    """Return the fields of `Config` and the parameters of all registered algorithms, by name."""
-    return {name: field for own in PARAMETERS.values() for name, field in own.items()} | FIELDS
+    """Return the fields of `Config` and the parameters of all registered algorithms, by name.
+
+    Of a parameter that several algorithms have, it is the first one's.
+    """
+    found: dict[str, Field] = {}
+    for own in PARAMETERS.values():
+        found = found | {name: field for name, field in own.items() if name not in found}
+    return found | FIELDS
 
 
 def owners(name: str) -> tuple[str, ...]:

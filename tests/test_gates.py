@@ -226,6 +226,8 @@ def test_lazy_dagger_hands_back_at_a_quarter_of_its_bound():
 def test_lazy_dagger_has_the_bound_of_its_code():
     assert float(fleetjax.make_config("navigation", "lazy_dagger").parameters["discrepancy_tau"]) == pytest.approx(0.008 * 4)
     assert float(fleetjax.make_config("navigation", "safe_dagger").parameters["discrepancy_tau"]) == pytest.approx(0.0025)
+    replaced = fleetjax.make_config("navigation").replace(algorithm="lazy_dagger")
+    assert float(replaced.parameters["discrepancy_tau"]) == pytest.approx(0.032)
 
 
 def test_dropout_dagger_asks_where_few_samples_are_near_the_human():
@@ -517,6 +519,21 @@ def test_asa_leaves_violations_in_the_initial_period():
 
 
 # Estimators, in a fleet
+
+
+@pytest.mark.parametrize(("estimate", "owner"), [("discrepancy", "safe_dagger"), ("novelty", "crsail")])
+def test_a_rule_without_an_estimators_parameter_gets_its_default(estimate: str, owner: str):
+    """The estimate on new states is that of the algorithm whose parameter it is."""
+    name = f"own_{estimate}"
+    fleetjax.register_priority(
+        name, lambda config: priority.stateless(lambda signals, key: signals.estimates[estimate]), estimators=(estimate,)
+    )
+    (parts, state), (_, other) = taught_fleet(name), taught_fleet(owner)
+    assert not parts.config.parameters
+    obs = jax.random.normal(jax.random.key(1), (6, parts.env.spec.observation_size))
+    own, usual = (parts.estimators[estimate].value(s.estimators[estimate], s.policy, obs, obs[:, :2]) for s in (state, other))
+    assert np.ptp(np.asarray(own)) > 0
+    np.testing.assert_array_equal(own, usual)
 
 
 @functools.cache

@@ -8,6 +8,7 @@ import optax
 
 from fleetjax.config import Config
 from fleetjax.envs import Env
+from fleetjax.field import PARAMETERS
 from fleetjax.learning import buffer
 from fleetjax.learning.critic import Transition
 from fleetjax.learning.estimator import Estimator, Step
@@ -53,12 +54,13 @@ def make_discrepancy(config: Config, env: Env, learner: Learner, supervisor: Sup
     """Chance that the robot's action differs from the human's by more than `discrepancy_tau`, in mean square.
 
     A classifier of observations. Its labels compare the human's actions in all human data with what the policy does there
-    now.
+    now. For an algorithm without the parameter `discrepancy_tau` it is 0.0025.
 
     Reference: Zhang and Cho, SafeDAgger, 2017; Hoque et al., LazyDAgger, 2021 (Section IV).
     """
     del supervisor
-    network, tau = make_network(env.spec, config.hidden_sizes, 1), config.parameters["discrepancy_tau"]
+    network = make_network(env.spec, config.hidden_sizes, 1)
+    tau = config.parameters.get("discrepancy_tau", PARAMETERS["safe_dagger"]["discrepancy_tau"].default)
 
     def init(key: jax.Array, data: HumanData, policy: PolicyState) -> Trained:
         key_network, key_train = jax.random.split(key)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from fleetjax.config import Config
 from fleetjax.envs import Env
+from fleetjax.field import PARAMETERS
 from fleetjax.learning import buffer
 from fleetjax.learning.estimator import Estimator
 from fleetjax.learning.imitation import HumanData, Learner, PolicyState
@@ -55,6 +56,7 @@ def make_novelty(config: Config, env: Env, learner: Learner, supervisor: Supervi
     Reference: CRSAIL, 2025 (arXiv 2512.00453); reimplemented from the text.
     """
     del learner, supervisor
+    rate = config.parameters.get("crsail_rate", PARAMETERS["crsail"]["crsail_rate"].default)
     number = REFERENCE_IMAGES if env.spec.image_shape else REFERENCES
 
     def init(key: jax.Array, data: HumanData, policy: PolicyState) -> Seen:
@@ -65,7 +67,7 @@ def make_novelty(config: Config, env: Env, learner: Learner, supervisor: Supervi
         states, known = data.pairs.rows.obs[index], index >= 0
         scaled = policy.normalizer(states)
         among = jnp.where(known, distance_to(scaled, scaled, known, NEIGHBOURS + 1), jnp.nan)
-        return Seen(states, index, jnp.maximum(jnp.nanquantile(among, 1.0 - config.parameters["crsail_rate"]), 1e-6))
+        return Seen(states, index, jnp.maximum(jnp.nanquantile(among, 1.0 - rate), 1e-6))
 
     def value(state: Seen, policy: PolicyState, obs: jax.Array, robot_action: jax.Array) -> jax.Array:
         del robot_action

@@ -1,6 +1,5 @@
 """Gates by how far the robot's action is from the human's: predicted by a classifier, by the ensemble, or known."""
 
-from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -25,7 +24,8 @@ def safe_dagger(config) -> Priority:
     P is the `"discrepancy"` classifier's. It learns from all human data, as the policy does, so it sees smaller differences
     than on new states; LazyDAgger's published code keeps a part of the data from the policy.
 
-    The default tau is 0.0025 per dimension.
+    The default tau is 0.0025 per dimension. The original compares the squared norm, a sum over dimensions, with 0.0025, which
+    is stricter.
 
     Reference: Zhang and Cho, SafeDAgger, 2017; reimplemented from the text.
     """
@@ -36,9 +36,10 @@ def safe_dagger(config) -> Priority:
 def lazy_dagger(config) -> Priority:
     """Ask if P(d > tau) >= `lazy_threshold`, as `safe_dagger`; hand back if the human's d < `lazy_handback` tau.
 
-    Two thresholds make fewer and longer interventions. The original's tau, 0.008 of the sum of the actions' squared ranges, is
-    0.032 per dimension of [-1, 1]. The original may also execute the human's action with noise, and records the action without
-    it. That option is not here: with `action_noise`, which models people, the noisy action is recorded.
+    A robot that still asks then keeps its human; in the original the human hands back, and the robot may ask again a timestep
+    later. Two thresholds make fewer and longer interventions. The original's tau, 0.008 of the sum of the actions' squared
+    ranges, is 0.032 per dimension of [-1, 1]. The original may also execute the human's action with noise, and records the
+    action without it. That option is not here: with `action_noise`, which models people, the noisy action is recorded.
 
     Reference: Hoque et al., LazyDAgger, 2021 (Algorithm 1, and the published code: the hand-back's factor is 0.25).
     """
@@ -51,12 +52,6 @@ def lazy_dagger(config) -> Priority:
         return gated(signals, asking, teleoperated(signals) & ~agrees)
 
     return stateless(score)
-
-
-def of_lazy_dagger(config) -> Mapping[str, Any]:
-    """Give LazyDAgger's bound on differences."""
-    del config
-    return {"discrepancy_tau": 0.032}
 
 
 def dropout_dagger(config) -> Priority:
@@ -83,7 +78,7 @@ def dropout_dagger(config) -> Priority:
 def oracle_discrepancy(config) -> Priority:
     """Ask if mean (a_r - a_h)^2 of actions >= `oracle_threshold`: the ceiling for rules that predict this difference.
 
-    It sees what the human would do on every robot, so it is no rule for real fleets.
+    It sees what the human would do on every robot, so it is no rule for real fleets. It has no published source.
     """
     threshold = config.parameters["oracle_threshold"]
     return stateless(lambda signals, key: gated(signals, above(known(distance(signals)), threshold)))
@@ -95,7 +90,7 @@ def _algorithm(name: str, make_priority, **others: Any) -> Algorithm:
 
 DISCREPANCIES: dict[str, Algorithm] = {
     "safe_dagger": _algorithm("safe_dagger", safe_dagger, estimators=("discrepancy",)),
-    "lazy_dagger": _algorithm("lazy_dagger", lazy_dagger, estimators=("discrepancy",), defaults=of_lazy_dagger),
+    "lazy_dagger": _algorithm("lazy_dagger", lazy_dagger, estimators=("discrepancy",)),
     "dropout_dagger": _algorithm("dropout_dagger", dropout_dagger, sees_supervisor=True),
     "oracle_discrepancy": _algorithm("oracle_discrepancy", oracle_discrepancy, sees_supervisor=True),
 }

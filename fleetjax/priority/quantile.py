@@ -60,6 +60,7 @@ def thrifty_quantile(config) -> Priority:
     human actions, over a batch of all human data (the estimator `"mean_discrepancy"`); the original computes it once, after
     cloning, over all demonstrations. G is the goal critic's chance of success, with the discount `goal_discount`, 0.999 (in
     the original 0.9999); where the environment has no goals, it is 1 - R. Robots that ask are ordered by max(U / q_U, q_G / G).
+    A robot that still asks when its human would hand back keeps that human; in the original it may ask again a timestep later.
 
     Reference: Hoque et al., ThriftyDAgger, 2021 (Section 4, and the published code: a = 0.01). Its start values 0.48 and
     0.495 are not used: the first timestep gives the first quantiles.

@@ -11,6 +11,7 @@ def round_robin(config) -> Priority:
     """Help the robot that has been without help longest, but none within `round_robin_threshold` timesteps of its last help.
 
     At its first score, robot i (from 0) counts as having waited N + 1 - i timesteps.
+    Operators do so out of habit; the rule has no published source.
     """
     threshold = config.parameters["round_robin_threshold"]
 
@@ -26,7 +27,10 @@ def round_robin(config) -> Priority:
 
 
 def longest_waiting(config) -> Priority:
-    """Violations, first come, first served: C by the number of timesteps for which a robot has been in violation."""
+    """Violations, first come, first served: C by the number of timesteps for which a robot has been in violation.
+
+    Operators serve a queue of alarms in this way; the rule has no published source.
+    """
 
     def init():
         return PerRobot(jnp.zeros(config.num_robots))

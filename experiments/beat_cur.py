@@ -315,6 +315,7 @@ def register() -> None:
 
 def main() -> None:
     """Run the variants that are asked for."""
+    register()  # their parameters may follow after `--`
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     scripts.add_names(parser, "environments", tuple(UNTIL))
     parser.add_argument("--variants", type=listed(str), default=[*VARIANTS], help="names [default: all with T]")
@@ -324,7 +325,6 @@ def main() -> None:
     names = (*VARIANTS, *LESSONS, *CHANGES)
     if unknown := [name for name in args.variants if name not in names]:
         parser.error(f"unknown variants: {', '.join(unknown)}; choose from {', '.join(names)}")
-    register()
     print("| environment | variant | successes | violations | human time | idle time |\n|---|---|---:|---:|---:|---:|")
     for environment in args.environments:
         for name in args.variants:

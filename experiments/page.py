@@ -132,9 +132,9 @@ def against_cur(found: list[Group], early: Sequence[Group] = ()) -> str:
         others = [(one, ", trained early") for one in early if one.config.environment == place]
         ceiling = [(one, "") for algorithm, one in here.items() if algorithm == "expert"]
         for one, how in (*usual, *others, *ceiling):
-            ratio = comparing.ratio(one, reference, "successes") if reference and one is not reference else None
+            ratio = comparing.ratio_interval(one, reference, "successes") if reference and one is not reference else ""
             cells = [f"{claims.NAMES[place]}, {text.label(one.config.algorithm)}{how}", str(len(one.runs))]
-            cells += [comparing.interval(comparing.values(one, "successes")), "" if ratio is None else f"{ratio:.2f}"]
+            cells += [comparing.interval(comparing.values(one, "successes")), ratio]
             table.append((*cells, *(mean(one, metric) for metric in ("violations", "human_steps", "idle"))))
     return text.markdown_table(table)
 

@@ -4,6 +4,8 @@ References: B. Efron, Better bootstrap confidence intervals, 1987; R. Agarwal et
 the statistical precipice, 2021.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 MIN_SEEDS = 5  # below this a bootstrap has too few different resamples, and the range tells more
@@ -42,19 +44,45 @@ def difference_bounds(values: np.ndarray, others: np.ndarray) -> tuple[np.ndarra
     return _bca((values, others), RESAMPLES)
 
 
-def _bca(samples: tuple[np.ndarray, ...], resamples: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the BCa interval of the mean of one sample, or of the difference between the means of two."""
-    from scipy import stats  # takes a second to import
+def ratio_bounds(values: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the 95 % BCa interval of the ratio of two means over the same seeds, or the range of the ratios of few seeds.
 
-    def statistic(first, *second, axis):
-        return first.mean(axis=axis) - (second[0].mean(axis=axis) if second else 0.0)
+    Args:
+        values: f64[S].
+        others: f64[S] of the same seeds, all > 0.
+    """
+    ratios = values / others
+    if len(values) < MIN_SEEDS or np.ptp(ratios) == 0:  # BCa is undefined for constants
+        return ratios.min(), ratios.max()
+    return _bca((values, others), RESAMPLES, _ratio, paired=True)
+
+
+def _difference(first: np.ndarray, *second: np.ndarray, axis: int) -> np.ndarray:
+    return first.mean(axis=axis) - (second[0].mean(axis=axis) if second else 0.0)
+
+
+def _ratio(first: np.ndarray, second: np.ndarray, axis: int) -> np.ndarray:
+    return first.mean(axis=axis) / second.mean(axis=axis)
+
+
+def _bca(
+    samples: tuple[np.ndarray, ...], resamples: int, statistic: Callable[..., np.ndarray] = _difference, *, paired: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the BCa interval of a statistic of samples: of the mean of one, or the difference between the means of two."""
+    from scipy import stats  # takes a second to import
 
     observed = np.asarray(statistic(*samples, axis=0))
     low, high = observed.copy(), observed.copy()
     varies = np.any([np.any(sample != sample[:1], axis=0) for sample in samples], axis=0)  # BCa is undefined for constants
     if np.any(varies):
         varying = tuple(sample[:, varies] if sample.ndim > 1 else sample for sample in samples)
-        options = {"n_resamples": resamples, "confidence_level": CONFIDENCE, "method": "BCa", "vectorized": True}
+        options = {
+            "n_resamples": resamples,
+            "confidence_level": CONFIDENCE,
+            "method": "BCa",
+            "vectorized": True,
+            "paired": paired,
+        }
         interval = stats.bootstrap(varying, statistic, axis=0, rng=np.random.default_rng(0), **options).confidence_interval
         low[varies], high[varies] = interval
     return low, high

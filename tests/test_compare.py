@@ -14,7 +14,7 @@ from scipy import stats
 
 import fleetjax
 from fleetjax import cli, envs, statistics
-from fleetjax.io import figure, folder, outcomes, plain, rows, sources
+from fleetjax.io import comparing, figure, folder, outcomes, plain, rows, sources
 
 STEPS = 300  # more than a thinned curve has points
 
@@ -51,9 +51,9 @@ def study(tmp_path):
     return tmp_path / "study"
 
 
-def direct(samples, statistic):
+def direct(samples, statistic, **others):
     """Return scipy's interval."""
-    options = {"n_resamples": 9999, "method": "BCa", "confidence_level": 0.95, "rng": np.random.default_rng(0)}
+    options = others | {"n_resamples": 9999, "method": "BCa", "confidence_level": 0.95, "rng": np.random.default_rng(0)}
     return stats.bootstrap(samples, statistic, **options).confidence_interval
 
 
@@ -67,6 +67,10 @@ def test_intervals_are_bca_bootstraps():
         statistics.difference_bounds(values[:, 1], others),
         direct((values[:, 1], others), lambda x, y, axis: np.mean(x, axis) - np.mean(y, axis)),
     )
+    np.testing.assert_allclose(
+        statistics.ratio_bounds(values[:, 1], values[:, 2]),
+        direct((values[:, 1], values[:, 2]), lambda x, y, axis: np.mean(x, axis) / np.mean(y, axis), paired=True),
+    )
 
 
 def test_intervals_of_what_does_not_vary_are_points():
@@ -75,12 +79,25 @@ def test_intervals_of_what_does_not_vary_are_points():
     assert (low[0], high[0]) == (3, 3)
     assert low[1] < 2 < high[1]
     np.testing.assert_array_equal(statistics.difference_bounds(values[:, 0], values[:, 0]), (0, 0))
+    np.testing.assert_array_equal(statistics.ratio_bounds(2 * values[:, 0], values[:, 0]), (2, 2))
+    assert statistics.ratio_bounds(3 * values[1:, 1], values[1:, 1]) == (3, 3)
 
 
 def test_few_seeds_have_a_range():
     few, more = np.array([4.0, 1.0, 2.0, 9.0]), np.arange(6.0)
     assert statistics.mean_bounds(few) == (1, 9)
     assert statistics.difference_bounds(few, more) == (1 - 5, 9 - 0)
+    assert statistics.ratio_bounds(few, np.array([2.0, 2.0, 1.0, 3.0])) == (0.5, 3)
+
+
+def test_ratios_are_of_the_seeds_that_both_groups_have():
+    totals = ({0: 4, 1: 9, 2: 70}, {1: 3, 0: 2, 5: 100})
+    one, other = (outcomes.group(sources.collect(runs_of("cur", total)))[0] for total in totals)
+    assert comparing.ratio(one, other, "successes") == pytest.approx(13 / 5)
+    assert comparing.ratio_interval(one, other, "successes") == "2.60 (2.00 to 3.00)"
+    nothing = outcomes.group(sources.collect(runs_of("cur", {0: 0, 1: 0})))[0]
+    assert comparing.ratio(one, nothing, "successes") is None
+    assert comparing.ratio_interval(one, nothing, "successes") == ""
 
 
 def test_the_interquartile_mean_leaves_out_a_quarter_at_each_end():

@@ -164,9 +164,9 @@ CASES = {
     "experiments/beat_cur.py": Case(
         (
             f"humanoid --variants random-half,risk-last --until 4 -- {FLEET}",
-            f"humanoid --variants teach-oldest -- {FLEET} --teaching-time 4",
+            f"humanoid --variants teach-oldest,teach-gain-apart,cur-dense,cur-priced -- {FLEET} --teaching-time 4 --price 0.1",
         ),
-        tuple(row("humanoid", name, *[r"\d+"] * 4) for name in ("random-half", "risk-last", "teach-oldest")),
+        tuple(row("humanoid", name, *[r"\d+"] * 4) for name in ("random-half", "risk-last", "teach-gain-apart", "cur-priced")),
         pace="long",
     ),
     "experiments/claims.py": Case(

@@ -139,10 +139,27 @@ def values_by_seed(one: Group, metric: str) -> dict[int, float]:
 
 def ratio(one: Group, other: Group, metric: str) -> float | None:
     """Return what a group achieved relative to another, over the seeds that both have; None if the other achieved nothing."""
+    mine, others = _of_both(one, other, metric)
+    return float(mine.sum() / others.sum()) if others.sum() else None
+
+
+def ratio_interval(one: Group, other: Group, metric: str) -> str:
+    """Return the same with its 95 % interval, or the range of the ratios of few seeds, as text; "" if there is none."""
+    mine, others = _of_both(one, other, metric)
+    if not others.sum():
+        return ""
+    number = f"{mine.sum() / others.sum():.2f}"
+    if len(mine) == 1 or not np.all(others):
+        return number
+    low, high = statistics.ratio_bounds(mine, others)
+    return f"{number} ({low:.2f} to {high:.2f})"
+
+
+def _of_both(one: Group, other: Group, metric: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return what two groups achieved f64[S], over the seeds that both have."""
     mine, others = (values_by_seed(each, metric) for each in (one, other))
-    shared = mine.keys() & others.keys()
-    base = sum(others[seed] for seed in shared)
-    return sum(mine[seed] for seed in shared) / base if base else None
+    shared = sorted(mine.keys() & others.keys())
+    return np.array([mine[seed] for seed in shared]), np.array([others[seed] for seed in shared])
 
 
 def _value(run: Outcome, metric: str) -> float:

@@ -27,7 +27,7 @@ from fleetjax.learning.estimator import Estimator
 from fleetjax.learning.imitation import stored_obs
 from fleetjax.learning.networks import ADAM, descend, make_network
 from fleetjax.priority import Priority, get_algorithm, lexicographic, stateless
-from fleetjax.priority.coverage import similarity
+from fleetjax.priority.coverage import pick, similarity
 
 HOLD = 50  # timesteps that a human stays with a robot in `held`
 DISCOUNT, RATE = 0.98, 0.005  # of the values of `make_gain`, and of their target networks
@@ -128,20 +128,11 @@ def apart(config: Any, signals: Any, worth: jax.Array) -> jax.Array:
 
     Robot j covers i by worth_i times their similarity, as in facility location. Robots whose human must stay count as picked.
     """
-    n, moving = worth.size, ~signals.violation
+    moving = ~signals.violation
     covers = similarity(signals.obs) * jnp.where(moving, worth, 0.0)[:, None]
     bound = signals.helped & (signals.help_time < config.min_teleop_time)
     covered = jnp.max(jnp.where(bound, covers, 0.0), axis=1)
-
-    def pick(carry, rank):
-        covered, ranks = carry
-        gain = jnp.sum(jnp.maximum(covers - covered[:, None], 0.0), axis=0)
-        best = jnp.argmax(jnp.where(moving & ~bound & (ranks == 0), gain, -1.0))
-        return (jnp.maximum(covered, covers[:, best]), ranks.at[best].set(rank)), None
-
-    ranks = jnp.arange(config.num_humans, 0, -1).astype(jnp.float32)
-    chosen = jax.lax.scan(pick, (covered, jnp.zeros(n)), ranks)[0][1]
-    return jnp.where(moving, chosen, 0.0)
+    return pick(covers, covered, moving & ~bound, jnp.arange(worth.size), config.num_humans)
 
 
 class Moved(NamedTuple):

@@ -240,7 +240,8 @@ def every_field() -> dict[str, Field]:
     """
     found: dict[str, Field] = {}
     for own in PARAMETERS.values():
-        found = found | {name: field for name, field in own.items() if name not in found}
+        for name, field in own.items():
+            found.setdefault(name, field)
     return found | FIELDS
 
 

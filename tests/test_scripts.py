@@ -166,7 +166,10 @@ CASES = {
             f"humanoid --variants random-half,risk-last --until 4 -- {FLEET}",
             f"humanoid --variants teach-oldest,teach-gain-apart,cur-dense,cur-priced -- {FLEET} --teaching-time 4 --price 0.1",
         ),
-        tuple(row("humanoid", name, *[r"\d+"] * 4) for name in ("random-half", "risk-last", "teach-gain-apart", "cur-priced")),
+        tuple(
+            row("humanoid", name, *[r"\d+"] * 4)
+            for name in ("random-half", "risk-last", "teach-oldest", "teach-gain-apart", "cur-dense", "cur-priced")
+        ),
         pace="long",
     ),
     "experiments/claims.py": Case(

@@ -85,25 +85,53 @@ def by_coverage(config) -> Allocator:
         bound = sharding.put(jnp.zeros(n, bool), jnp.where(stays, humans.robot, n), True)
         covered = jnp.max(jnp.where(bound[None], covers, 0.0), axis=1)
         link = jnp.ones(n, jnp.float32) if signals.link is None else signals.link
-        places = tie_order(key, n)
+        places = tie_order(key, n)  # ties are broken by chance
 
-        def pick(carry: tuple[jax.Array, jax.Array, jax.Array], turn: jax.Array):
-            covered, order, left = carry
-            gain = jnp.sum(jnp.maximum(covers - covered[:, None], 0.0), axis=0) * link
-            gain = jnp.where(left, gain, -1.0)
-            best = places[jnp.argmax(gain[places])]  # ties are broken by chance
-            good = gain[best] >= config.parameters["asa_threshold"]
-            order = order.at[jnp.where(good, best, n)].set(turn, mode="drop")
-            covered = jnp.where(good, jnp.maximum(covered, covers[:, best]), covered)
-            return (covered, order, left.at[best].set(False)), None
-
-        number = min(humans.robot.shape[0], n)
-        turns = jnp.arange(number, 0, -1).astype(jnp.float32)
-        start = (covered, jnp.zeros(n, jnp.float32), (own > 0) & ~bound)
-        order = jax.lax.scan(pick, start, turns)[0][1]
+        number, least = min(humans.robot.shape[0], n), config.parameters["asa_threshold"]
+        order = pick(covers, covered, (own > 0) & ~bound, places, number, link=link, least=least)
         return allocate(order, humans, min_time, key, available)
 
     return cover
+
+
+def pick(
+    covers: jax.Array,
+    covered: jax.Array,
+    left: jax.Array,
+    places: jax.Array,
+    number: int,
+    *,
+    link: jax.Array | float = 1.0,
+    least: jax.Array | float = 0.0,
+) -> jax.Array:
+    """Pick robots one by one, each time the one whose gain is largest, by greedy facility location.
+
+    Args:
+        covers: f32[N, N], entry (i, j): how much of robot i is covered if j is picked.
+        covered: f32[N], what is covered already.
+        left: bool[N], robots that may be picked.
+        places: i32[N], the robots in the order in which ties are broken.
+        number: of picks, at most N.
+        link: f32[N], a factor of each robot's gain.
+        least: gain below which nobody is picked.
+
+    Returns:
+        f32[N]: `number` for the first pick, `number` - 1 for the second, and so on; 0 for the others.
+    """
+    n = covered.shape[0]
+
+    def turn_of(carry: tuple[jax.Array, jax.Array, jax.Array], turn: jax.Array):
+        covered, order, left = carry
+        gain = jnp.sum(jnp.maximum(covers - covered[:, None], 0.0), axis=0) * link
+        gain = jnp.where(left, gain, -1.0)
+        best = places[jnp.argmax(gain[places])]
+        good = gain[best] >= least
+        order = order.at[jnp.where(good, best, n)].set(turn, mode="drop")
+        covered = jnp.where(good, jnp.maximum(covered, covers[:, best]), covered)
+        return (covered, order, left.at[best].set(False)), None
+
+    turns = jnp.arange(number, 0, -1).astype(jnp.float32)
+    return jax.lax.scan(turn_of, (covered, jnp.zeros(n, jnp.float32), left), turns)[0][1]
 
 
 COVERAGE: dict[str, Algorithm] = {

@@ -49,6 +49,27 @@ def pytest_configure(config: pytest.Config) -> None:
     jax.config.update("jax_num_cpu_devices", 8)  # virtual ones, for `test_mesh.py`; others use the first
 
 
+@pytest.fixture(autouse=True)
+def names_of_a_test() -> Iterator[None]:
+    """Let what a test registers vanish after it, so that no other test meets it."""
+    from fleetjax import envs, field, humans, priority, supervisors
+    from fleetjax.learning import estimators
+
+    registries = (
+        envs.ENVIRONMENTS,
+        priority.ALGORITHMS,
+        supervisors.SUPERVISORS,
+        estimators.ESTIMATORS,
+        humans.HUMAN_MODELS,
+        humans.LINK_MODELS,
+    )
+    before = [(table, dict(table)) for table in (field.PARAMETERS, *(registry.entries for registry in registries))]
+    yield
+    for table, entries in before:
+        table.clear()
+        table.update(entries)
+
+
 @pytest.fixture(params=["quickly", pytest.param("optimized", marks=pytest.mark.slow)])
 def compiled_both_ways() -> None:
     """Run a test about bits a second time, among the slow tests, where XLA optimises."""

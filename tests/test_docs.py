@@ -15,7 +15,6 @@ import jax
 import pytest
 
 import fleetjax
-from fleetjax import envs, priority, supervisors
 from fleetjax.io import flags
 
 ROOT = Path(__file__).parents[1]
@@ -61,13 +60,6 @@ def commands(text: str) -> list[str]:
 
 
 @pytest.fixture
-def own_registries(monkeypatch):
-    """Let what a page registers vanish after it."""
-    for registry in (envs.ENVIRONMENTS, priority.ALGORITHMS, supervisors.SUPERVISORS):
-        monkeypatch.setattr(registry, "entries", dict(registry.entries))
-
-
-@pytest.fixture
 def small_fleets(monkeypatch):
     """Let pages run small fleets where they do not ask for a size."""
     make_config = fleetjax.make_config
@@ -88,7 +80,7 @@ def run_page(name: str) -> dict:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("own_registries", "quick_compilation")
+@pytest.mark.usefixtures("quick_compilation")
 def test_custom_page_runs(capsys):
     metrics = run_page("docs/custom.md")["result"].metrics
     assert metrics.successes.sum() > 0
@@ -96,7 +88,7 @@ def test_custom_page_runs(capsys):
     assert "brax/inverted_pendulum" in capsys.readouterr().out
 
 
-@pytest.mark.usefixtures("own_registries", "quick_compilation", "small_fleets")
+@pytest.mark.usefixtures("quick_compilation", "small_fleets")
 @pytest.mark.parametrize("name", [pytest.param(p, marks=pytest.mark.slow) for p in PAGES if p != "docs/custom.md"])
 def test_other_pages_run(name):
     assert run_page(name)
@@ -114,7 +106,7 @@ def test_examples_in_docstrings():
     assert not any(result.failed for result in results)
 
 
-def test_commands_can_be_typed(monkeypatch, own_registries):
+def test_commands_can_be_typed(monkeypatch):
     rules = types.ModuleType("my_rules")
     rules.surprise = fleetjax.Algorithm(lambda config: None)
     monkeypatch.setitem(sys.modules, "my_rules", rules)

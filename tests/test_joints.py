@@ -13,7 +13,6 @@ from compiling import compiled
 import fleetjax
 from fleetjax import cli, priority
 from fleetjax.io import plain
-from fleetjax.learning import estimators
 
 SMALL = {
     "num_robots": 4,
@@ -35,9 +34,7 @@ KEY = jax.random.key(0)
 
 
 @pytest.fixture(autouse=True)
-def own_registries(monkeypatch):
-    for registry in (priority.ALGORITHMS, estimators.ESTIMATORS):
-        monkeypatch.setattr(registry, "entries", dict(registry.entries))
+def toy_supervisors():
     with toy_envs.registered_supervisors():
         yield
 

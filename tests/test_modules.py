@@ -34,8 +34,7 @@ _numbers = itertools.count()
 @pytest.fixture
 def module(tmp_path, monkeypatch):
     """A function that writes a module of a new name below a new folder on the path, and returns that name."""
-    monkeypatch.setattr(priority.ALGORITHMS, "entries", dict(priority.ALGORITHMS.entries))
-    before, place = dict(field.PARAMETERS), tmp_path / "modules"
+    place = tmp_path / "modules"
     place.mkdir()
     monkeypatch.syspath_prepend(place)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(place), os.environ.get("PYTHONPATH", "")]))
@@ -45,9 +44,7 @@ def module(tmp_path, monkeypatch):
         (place / f"{name}.py").write_text(content)
         return name
 
-    yield write
-    field.PARAMETERS.clear()
-    field.PARAMETERS.update(before)
+    return write
 
 
 def test_a_rule_of_a_module_has_its_parameters(module):

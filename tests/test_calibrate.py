@@ -29,7 +29,7 @@ def solved(tmp_path_factory):
 
 
 def test_the_value_spends_the_time_in_runs_that_anyone_can_look_at(solved):
-    found = json.loads((solved / "calibration.json").read_text())
+    found = json.loads((solved / "calibration-random_threshold-120.json").read_text())
     assert found["solved"]
     assert found["field"] == "random_threshold"
     spent = []
@@ -98,7 +98,8 @@ def test_of_values_with_all_seeds_the_nearest_is_taken(tmp_path, monkeypatch):
 def test_the_nearest_is_told_where_nothing_spends_so_much(tmp_path, capsys):
     assert calibrate(tmp_path, "--human-time", 239, "--seeds", 1, "--most", 2, "--tolerance", 0.001) == 0
     assert "No value that was tried spends 239; this one is the nearest." in capsys.readouterr().out
-    assert json.loads((tmp_path / "calibration.json").read_text(), parse_constant=pytest.fail)["error"] is None
+    answer = (tmp_path / "calibration-random_threshold-239.json").read_text()
+    assert json.loads(answer, parse_constant=pytest.fail)["error"] is None
 
 
 @pytest.mark.parametrize(
@@ -110,6 +111,7 @@ def test_the_nearest_is_told_where_nothing_spends_so_much(tmp_path, capsys):
         (["--human-time", "100", "--field", "uncertainty"], "field = 'uncertainty' must be a real-valued traced field"),
         (["--human-time", "100", "--seeds", "0"], "seeds must name one or more"),
         (["--human-time", "100", "--most", "0"], "most = 0 must be at least 1"),
+        (["--human-time", "100", "--field", "temperature"], "field = 'temperature' makes no difference to 'random'"),
         (["--human-time", "100", "--field", "takeover_time"], "takeover_time has no effect with human_model = 'perfect'"),
         (["--human-time", "100", "--field", "success_return"], "field = 'success_return' may be negative"),
         (["--human-time", "100", "--first-seed", str(2**32 - 1), "--seeds", "2"], f"end at seed {2**32}, beyond {2**32 - 1}"),

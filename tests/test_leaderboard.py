@@ -142,12 +142,20 @@ def test_rules_with_two_thresholds_have_both_tuned(tmp_path, monkeypatch, seeds,
         return sources.collect([(entry.config, 100, metrics)])
 
     monkeypatch.setattr(calibration, "calibrate", calibrate)
+    monkeypatch.setattr(calibration, "has_effect", lambda request: True)
     monkeypatch.setattr(leaderboard, "collect", collect)
     place = leaderboard.tune(entry)
     assert place.solved
     assert place.settings == {"uncertainty_threshold": 0.1, "risk_threshold": best}
     place = leaderboard.tune(entry._replace(budget=7000))
     assert (place.solved, place.spent, place.risk_threshold) == (False, 5100.0, 0.8)
+
+
+def test_a_rule_without_a_threshold_is_not_calibrated(tmp_path, monkeypatch):
+    monkeypatch.setattr(calibration, "calibrate", lambda request: pytest.fail("a calibration runs"))
+    (entry,) = leaderboard.entries(["longest_waiting"], ["navigation"], (5000,), 2, tmp_path)
+    place = leaderboard.tune(entry)
+    assert (place.field, place.settings, place.solved) == ("", {}, False)
 
 
 def test_rules_that_need_goals_are_left_out_where_there_are_none(tmp_path, capsys):
@@ -197,7 +205,8 @@ def add(tmp_path, monkeypatch):
             return sources.collect([(done[-1].config, done[-1].seed, make_metrics(0, 40))])
 
         def tune(entry):
-            return leaderboard.Place(*entry[:3], "random_threshold", 0.9, 300.0, solved=True)
+            field = "random_threshold" if entry.algorithm == "random" else ""
+            return leaderboard.Place(*entry[:3], field, 0.9, 300.0, solved=bool(field))
 
         for name, replacement in {"tune": tune, "collect": collect}.items():
             monkeypatch.setattr(leaderboard, name, replacement)

@@ -5,15 +5,18 @@ import math
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from fleetjax import envs
+from fleetjax.checks import check_run
 from fleetjax.config import Config, all_fields, check_one_for_all, get_value, validate
+from fleetjax.gradients import unused
 from fleetjax.io import files, folder, resumable, text
 from fleetjax.io.progress import say
+from fleetjax.metrics import Metrics
 from fleetjax.search import FIRST_STEP, Scale, solve
-
-FILE = "calibration.json"
 
 
 class Request(NamedTuple):
@@ -43,6 +46,11 @@ class Request(NamedTuple):
         """Return a run with this value of the field."""
         name = f"{self.field}-{np.float32(value)!s}-seed{seed}"
         return folder.Run(self.output / name, self.config.replace(**{self.field: _stored(value)}), seed)
+
+    @property
+    def answer(self) -> Path:
+        """The file of what was found."""
+        return self.output / f"calibration-{self.field}-{self.human_time:.10g}.json"
 
 
 class Calibration(NamedTuple):
@@ -100,6 +108,16 @@ def check(request: Request) -> None:
         raise ValueError("seeds must name one or more")
 
 
+def has_effect(request: Request) -> bool:
+    """Return whether the human time of a run depends on the field, as its program tells without being run."""
+
+    def human_time(metrics: Metrics, config: Config) -> jax.Array:
+        del config
+        return jnp.sum(metrics.human_steps)
+
+    return not unused(request.config, check_run(request.config), human_time, [request.field])
+
+
 def calibrate(request: Request) -> Calibration:
     """Search with the first seed; from there, search for the mean over all seeds.
 
@@ -127,7 +145,7 @@ def calibrate(request: Request) -> Calibration:
     content = found._asdict() | {"field": request.field, "wanted": request.human_time, "seeds": request.seeds}
     if math.isnan(found.error):
         content["error"] = None  # JSON has no NaN
-    files.write_json(request.output / FILE, content | {"versions": folder.versions()})
+    files.write_json(request.answer, content | {"versions": folder.versions()})
     return found
 
 

@@ -199,6 +199,10 @@ def calibrate_field(arguments: argparse.Namespace) -> None:
                 f"--first-seed {arguments.first_seed} and --seeds {arguments.seeds} end at seed {request.seeds[-1]}, "
                 f"beyond {parameters.LARGEST_SEED}; lower one"
             )
+        if not calibration.has_effect(request):
+            raise ValueError(
+                f"field = {request.field!r} makes no difference to {config.algorithm!r}; choose another by --field"
+            )
         found = calibration.calibrate(request)
     print(calibration.report(request, found))
 

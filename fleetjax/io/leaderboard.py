@@ -33,7 +33,6 @@ BUDGETS = {  # human timesteps
     "anymal": (10_000,),
     "allegro_hand": (10_000,),
 }
-FIXED = ("constraint", "constraint_trained", "longest_waiting")  # rules without a threshold
 
 
 class Effort(NamedTuple):
@@ -318,8 +317,7 @@ def _check_alike(store: Store, environments: Collection[str]) -> None:
 
 
 def _compete(store: Store, entry: Entry) -> None:
-    fixed = Place(*entry[:3], "", 0.0, None, solved=False)
-    place = fixed if entry.algorithm in FIXED else store.find(*entry[:3]) or tune(entry)
+    place = store.find(*entry[:3]) or tune(entry)
     store.add(place)
     name = "-".join(f"{field}-{np.float32(value)!s}" for field, value in place.settings.items()) or "as-it-is"
     config = entry.config.replace(**place.settings)
@@ -337,6 +335,8 @@ def _compete(store: Store, entry: Entry) -> None:
 
 def tune(entry: Entry) -> Place:
     """Return the thresholds at which a rule spends its budget with the most successes, or comes nearest to it."""
+    if not calibration.has_effect(next(iter(entry.requests.values()))):
+        return Place(*entry[:3], "", 0.0, None, solved=False)
     best, most = None, (False, -np.inf)
     for risk, request in entry.requests.items():
         request.output.mkdir(parents=True, exist_ok=True)

@@ -123,16 +123,17 @@ def density(signals: Any) -> jax.Array:
     return similarity(signals.obs) @ (~signals.violation).astype(jnp.float32)
 
 
-def apart(config: Any, signals: Any, worth: jax.Array) -> jax.Array:
+def apart(config: Any, signals: Any, worth: jax.Array, chance: jax.Array) -> jax.Array:
     """Return f32[N], M for the robot that covers most of the fleet's `worth` f32[N], M - 1 for the next one, and so on.
 
     Robot j covers i by worth_i times their similarity, as in facility location. Robots whose human must stay count as picked.
+    Ties are frequent (of two robots that are nearest to each other), and broken by `chance` f32[N].
     """
     moving = ~signals.violation
     covers = similarity(signals.obs) * jnp.where(moving, worth, 0.0)[:, None]
-    bound = signals.helped & (signals.help_time < config.min_teleop_time)
+    bound = moving & signals.helped & (signals.help_time < config.min_teleop_time)
     covered = jnp.max(jnp.where(bound, covers, 0.0), axis=1)
-    return pick(covers, covered, moving & ~bound, jnp.arange(worth.size), config.num_humans)
+    return pick(covers, covered, moving & ~bound, jnp.argsort(chance), config.num_humans)
 
 
 class Moved(NamedTuple):
@@ -207,11 +208,11 @@ WORTH = {
     "random": lambda config, signals, chance: chance,
     "oldest": lambda config, signals, chance: chance * (signals.episode_step / 1000.0 + 1e-3) ** 3,
     "dense": lambda config, signals, chance: signals.uncertainty * density(signals),
-    "apart": lambda config, signals, chance: apart(config, signals, jnp.ones_like(chance)),
+    "apart": lambda config, signals, chance: apart(config, signals, jnp.ones_like(chance), chance),
     "gain": lambda config, signals, chance: signals.estimates["gain"] * chance,
     "until-certain": lambda config, signals, chance: chance + stays_uncertain(signals),
-    "dense-apart": lambda config, signals, chance: apart(config, signals, signals.uncertainty * density(signals)),
-    "gain-apart": lambda config, signals, chance: apart(config, signals, signals.estimates["gain"]),
+    "dense-apart": lambda config, signals, chance: apart(config, signals, signals.uncertainty * density(signals), chance),
+    "gain-apart": lambda config, signals, chance: apart(config, signals, signals.estimates["gain"], chance),
 }
 
 
@@ -264,7 +265,8 @@ def make_change(name: str, config: Any) -> Priority:
         if name == "cur-dense":
             doubt = jnp.where(asks, doubt * density(signals), 0.0)  # at least as large as `doubt`
         elif name == "cur-apart":
-            doubt = jnp.where(asks, threshold + apart(config, signals, jnp.where(asks, doubt, 0.0)), 0.0)
+            chance = jax.random.uniform(key, doubt.shape)
+            doubt = jnp.where(asks, threshold + apart(config, signals, jnp.where(asks, doubt, 0.0), chance), 0.0)
         elif name == "cur-gain":
             doubt = signals.estimates["gain"]
         elif name == "cur-until-certain":

@@ -28,6 +28,7 @@ from fleetjax.learning.imitation import stored_obs
 from fleetjax.learning.networks import ADAM, descend, make_network
 from fleetjax.priority import Priority, get_algorithm, lexicographic, stateless
 from fleetjax.priority.coverage import pick, similarity
+from fleetjax.priority.ranks import above
 
 HOLD = 50  # timesteps that a human stays with a robot in `held`
 DISCOUNT, RATE = 0.98, 0.005  # of the values of `make_gain`, and of their target networks
@@ -91,7 +92,6 @@ LESSONS = {
     "teach-dense-apart": Lesson(choice="dense-apart"),
     "teach-gain-apart": Lesson(choice="gain-apart"),
 }
-CHANGES = ("cur-dense", "cur-apart", "cur-gain", "cur-until-certain", "cur-priced")  # of C.U.R.
 UNTIL = {"humanoid": 900.0, "anymal": 850.0, "allegro_hand": 900.0}  # timesteps
 
 
@@ -216,6 +216,27 @@ WORTH = {
 }
 
 
+# What C.U.R. sees instead of the uncertainty: `(config, Signals[N], random numbers f32[N]) -> f32[N]`.
+DOUBT = {
+    "cur-dense": lambda config, signals, chance: uncertain(config, signals) * density(signals),  # at least the uncertainty
+    "cur-apart": lambda config, signals, chance: jnp.where(
+        uncertain(config, signals) > 0,
+        config.uncertainty_threshold + apart(config, signals, uncertain(config, signals), chance),
+        0.0,
+    ),
+    "cur-gain": lambda config, signals, chance: signals.estimates["gain"],
+    "cur-until-certain": lambda config, signals, chance: (
+        signals.uncertainty + jnp.where(stays_uncertain(signals), config.uncertainty_threshold, 0.0)
+    ),
+}
+CHANGES = (*DOUBT, "cur-priced")
+
+
+def uncertain(config: Any, signals: Any) -> jax.Array:
+    """Return f32[N], the uncertainty of robots that ask by it; 0 for the others."""
+    return above(signals.uncertainty, config.uncertainty_threshold)
+
+
 def stays_uncertain(signals: Any) -> jax.Array:
     """Return bool[N], robots with a human who are still more uncertain than half of the fleet."""
     return signals.helped & (signals.uncertainty > jnp.median(signals.uncertainty))
@@ -260,23 +281,14 @@ def make_change(name: str, config: Any) -> Priority:
 
     def score(signals, memory, key):
         taught, recent = memory
-        doubt, threshold = signals.uncertainty, config.uncertainty_threshold
-        asks = doubt >= threshold
-        if name == "cur-dense":
-            doubt = jnp.where(asks, doubt * density(signals), 0.0)  # at least as large as `doubt`
-        elif name == "cur-apart":
-            chance = jax.random.uniform(key, doubt.shape)
-            doubt = jnp.where(asks, threshold + apart(config, signals, jnp.where(asks, doubt, 0.0), chance), 0.0)
-        elif name == "cur-gain":
-            doubt = signals.estimates["gain"]
-        elif name == "cur-until-certain":
-            doubt = jnp.where(stays_uncertain(signals), threshold + doubt, doubt)
-        else:
+        if name == "cur-priced":
             recent = follow(recent, signals, config.parameters["price"])
             pays = recent >= config.parameters["price"]
-            signals = signals._replace(risk=jnp.where(pays, signals.risk, 0.0))
-            doubt = jnp.where(pays, doubt, 0.0)
-        scores, taught = cur.score(signals._replace(uncertainty=doubt), taught, key)
+            seen = {"uncertainty": jnp.where(pays, signals.uncertainty, 0.0), "risk": jnp.where(pays, signals.risk, 0.0)}
+        else:
+            chance = jax.random.uniform(key, signals.violation.shape)
+            seen = {"uncertainty": DOUBT[name](config, signals, chance)}
+        scores, taught = cur.score(signals._replace(**seen), taught, key)
         return scores, (taught, recent)
 
     return Priority(init=lambda: (cur.init(), jnp.full((), 4.0)), score=score)

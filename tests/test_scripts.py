@@ -26,6 +26,7 @@ SCRIPTS = sorted(
     if "\ndef main(" in path.read_text()
 )
 FLEET = " ".join(TINY)
+CHANGED = ("teach-oldest", "teach-gain-apart", "cur-dense", "cur-apart", "cur-until-certain", "cur-priced")  # of beat_cur.py
 PPO = "num_envs=8 num_eval_envs=2 episode_length=10 unroll_length=4 batch_size=8 num_minibatches=2"
 
 
@@ -164,12 +165,9 @@ CASES = {
     "experiments/beat_cur.py": Case(
         (
             f"humanoid --variants random-half,risk-last --until 4 -- {FLEET}",
-            f"humanoid --variants teach-oldest,teach-gain-apart,cur-dense,cur-priced -- {FLEET} --teaching-time 4 --price 0.1",
+            f"humanoid --variants {','.join(CHANGED)} -- {FLEET} --teaching-time 4 --price 0.1",
         ),
-        tuple(
-            row("humanoid", name, *[r"\d+"] * 4)
-            for name in ("random-half", "risk-last", "teach-oldest", "teach-gain-apart", "cur-dense", "cur-priced")
-        ),
+        tuple(row("humanoid", name, *[r"\d+"] * 4) for name in ("random-half", "risk-last", *CHANGED)),
         pace="long",
     ),
     "experiments/claims.py": Case(

@@ -51,23 +51,22 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture(autouse=True)
 def names_of_a_test() -> Iterator[None]:
-    """Let what a test registers vanish after it, so that no other test meets it."""
-    from fleetjax import envs, field, humans, priority, supervisors
-    from fleetjax.learning import estimators
+    """Let what a test registers vanish after it."""
+    import registering
 
-    registries = (
-        envs.ENVIRONMENTS,
-        priority.ALGORITHMS,
-        supervisors.SUPERVISORS,
-        estimators.ESTIMATORS,
-        humans.HUMAN_MODELS,
-        humans.LINK_MODELS,
-    )
-    before = [(table, dict(table)) for table in (field.PARAMETERS, *(registry.entries for registry in registries))]
-    yield
-    for table, entries in before:
-        table.clear()
-        table.update(entries)
+    with registering.only_here():
+        yield
+
+
+@pytest.fixture(scope="module")
+def toy_supervisors() -> Iterator[None]:
+    """Register the supervisors of `toy_envs.py` for as long as a file's tests run."""
+    import registering
+    import toy_envs
+
+    with registering.only_here():
+        toy_envs.register_supervisors()
+        yield
 
 
 @pytest.fixture(params=["quickly", pytest.param("optimized", marks=pytest.mark.slow)])

@@ -9,10 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import registering
 from compiling import compiled
 
 import fleetjax
-from fleetjax import envs, supervisors
+from fleetjax import envs
 
 HORIZON = 60
 NUM_ROBOTS = 3
@@ -22,8 +23,7 @@ FEEDBACK = jnp.array([0.3, 3.0, 0.4, 0.6])  # cart position and pole angle, then
 @pytest.fixture(scope="module", autouse=True)
 def balance():
     """Register an analytic supervisor for as long as this module runs."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(supervisors.SUPERVISORS, "entries", dict(supervisors.SUPERVISORS.entries))
+    with registering.only_here():
         feedback = fleetjax.Supervisor(lambda state, key: jnp.clip(state.obs @ FEEDBACK, -1.0, 1.0)[None])
         fleetjax.register_supervisor("balance", lambda env: feedback)
         yield feedback

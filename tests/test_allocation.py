@@ -18,6 +18,8 @@ from fleetjax import allocation
 from fleetjax.allocation import allocate, helper_of
 from fleetjax.types import HumanState
 
+pytestmark = pytest.mark.usefixtures("toy_supervisors")
+
 SHAPES = [(7, 3), (5, 5), (4, 1)]  # robots, humans
 MIN_TELEOP_TIME, HARD_RESET_TIME = 4, 2
 quick_allocate = compiled(allocate)
@@ -186,12 +188,6 @@ def test_helper_of_is_the_inverse_of_the_allocation(scene):
     for human, robot in enumerate(new.robot):
         assert robot == -1 or helper[robot] == human
     assert np.sum(helper >= 0) == np.sum(new.robot >= 0)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def toy_supervisors():
-    with toy_envs.registered_supervisors():
-        yield
 
 
 @functools.cache

@@ -7,14 +7,10 @@ import toy_envs
 import fleetjax
 from fleetjax import envs
 
+pytestmark = pytest.mark.usefixtures("toy_supervisors")
+
 QUICK = ("navigation", "humanoid")  # the others are slow tests
 GOOD = toy_envs.scripted([5, 0, 0, 0], [3, 0, 0, 0], horizon=20, new_goals=True)
-
-
-@pytest.fixture(autouse=True)
-def toy_supervisors():
-    with toy_envs.registered_supervisors():
-        yield
 
 
 @pytest.mark.parametrize(

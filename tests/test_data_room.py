@@ -12,6 +12,8 @@ from compiling import compiled
 import fleetjax
 from fleetjax.learning import critic, imitation, pretraining
 
+pytestmark = pytest.mark.usefixtures("toy_supervisors")
+
 SMALL = {
     "num_robots": 4,
     "num_humans": 2,
@@ -33,12 +35,6 @@ KEY = jax.random.key(0)
 @pytest.fixture(scope="module")
 def config():
     return fleetjax.make_config("navigation", "uc", **SMALL)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def toy_supervisors():
-    with toy_envs.registered_supervisors():
-        yield
 
 
 @pytest.fixture(scope="module")

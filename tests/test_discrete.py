@@ -13,15 +13,9 @@ import fleetjax
 from fleetjax.envs import begin
 from fleetjax.learning import imitation
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("toy_supervisors")]
 
 NUM_CHOICES = 4
-
-
-@pytest.fixture(scope="module", autouse=True)
-def toy_supervisors():
-    with toy_envs.registered_supervisors():
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -18,6 +18,8 @@ from fleetjax.learning import critic, imitation
 from fleetjax.priority import base
 from fleetjax.types import HumanState
 
+pytestmark = pytest.mark.usefixtures("toy_supervisors")
+
 FALLS_AT = [7, 7, 7, 11, 0, 13]
 SUCCEEDS_AT = [0, 0, 0, 0, 6, 0]
 FAULTS: dict[str, tuple[Callable[..., Fleet], str, str]] = {}
@@ -189,12 +191,6 @@ def critic_learns_from_robots_that_stand_still(patch, config, env):
 
     patch.setattr(critic, "make_critic", make_critic)
     return make_fleet(config, env)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def toy_supervisors():
-    with toy_envs.registered_supervisors():
-        yield
 
 
 ENV = toy_envs.scripted(FALLS_AT, SUCCEEDS_AT, horizon=20)

@@ -14,6 +14,8 @@ import fleetjax
 from fleetjax import cli, priority
 from fleetjax.io import plain
 
+pytestmark = pytest.mark.usefixtures("toy_supervisors")
+
 SMALL = {
     "num_robots": 4,
     "num_humans": 2,
@@ -31,12 +33,6 @@ SMALL = {
     "num_critic_transitions": 20,
 }
 KEY = jax.random.key(0)
-
-
-@pytest.fixture(autouse=True)
-def toy_supervisors():
-    with toy_envs.registered_supervisors():
-        yield
 
 
 def everybody(config):

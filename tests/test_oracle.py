@@ -14,6 +14,8 @@ from reference import oracle, recording
 import fleetjax
 from fleetjax import envs
 
+pytestmark = pytest.mark.usefixtures("toy_supervisors")
+
 SMALL = {
     "num_robots": 8,
     "num_steps": 200,
@@ -53,12 +55,6 @@ TOY_CASES = {
     "random": ("random", {"random_threshold": 0.7}, False),
     "constraint": ("constraint", {}, False),
 }
-
-
-@pytest.fixture(scope="module", autouse=True)
-def toy_supervisors():
-    with toy_envs.registered_supervisors():
-        yield
 
 
 def run_both(env, configs: list[fleetjax.Config], absences: list[float], seed: int = 1):

@@ -16,13 +16,9 @@ from fleetjax.envs import base
 from fleetjax.learning import imitation
 from fleetjax.types import HumanState
 
+pytestmark = pytest.mark.usefixtures("toy_supervisors")
+
 quick_allocate = compiled(allocate)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def toy_supervisors():
-    with toy_envs.registered_supervisors():
-        yield
 
 
 def test_semantic_01_order_of_a_timestep(monkeypatch):

@@ -17,17 +17,13 @@ from fleetjax.learning.buffer import is_buffer
 from fleetjax.learning.networks import Normalizer
 from fleetjax.learning.pretraining import collect_demonstrations
 
+pytestmark = pytest.mark.usefixtures("toy_supervisors")
+
 SPEC = EnvSpec("hand", 1, 1, 10, 1.0, has_goal=True, supervisor="toy_scripted")
 IDENTITY = Normalizer(jnp.zeros(1), jnp.ones(1), jnp.float32(jnp.inf))
 SMALL = fleetjax.Config().replace(
     hidden_sizes=(1,), ensemble_size=2, batch_size=8, num_robots=4, num_humans=2, critic_capacity=20, risk_discount=0.5
 )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def toy_supervisors():
-    with toy_envs.registered_supervisors():
-        yield
 
 
 def logit(probability):

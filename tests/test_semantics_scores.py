@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import toy_envs
 from compiling import compiled
 from reference.scenario import NOBODY, play
 from toy_envs import NEVER
@@ -14,11 +13,7 @@ from fleetjax import priority
 from fleetjax.metrics import Metrics
 from fleetjax.types import Signals
 
-
-@pytest.fixture(scope="module", autouse=True)
-def toy_supervisors():
-    with toy_envs.registered_supervisors():
-        yield
+pytestmark = pytest.mark.usefixtures("toy_supervisors")
 
 
 def test_semantic_13_metrics():

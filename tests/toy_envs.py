@@ -1,10 +1,7 @@
 """Small environments for tests: `scripted`, in which everything is known beforehand, and `grid`, with discrete actions.
 
-Their supervisors are registered while `registered_supervisors` is open, so that no other test meets them.
+The fixture `toy_supervisors` registers their supervisors.
 """
-
-import contextlib
-from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
@@ -111,14 +108,7 @@ def teach_grid(state: EnvState) -> jax.Array:
     return jax.nn.one_hot(jnp.where(way[0] != 0, first, second), 4)
 
 
-@contextlib.contextmanager
-def registered_supervisors() -> Iterator[None]:
-    """Register the supervisors `toy_scripted` and `toy_grid` for as long as this is open."""
-    teachers = {"toy_scripted": teach_scripted, "toy_grid": teach_grid}
-    for name, teach in teachers.items():
+def register_supervisors() -> None:
+    """Register the supervisors `toy_scripted` and `toy_grid`."""
+    for name, teach in {"toy_scripted": teach_scripted, "toy_grid": teach_grid}.items():
         supervisors.register_supervisor(name, lambda env, teach=teach: supervisors.Supervisor(lambda state, key: teach(state)))
-    try:
-        yield
-    finally:
-        for name in teachers:
-            del supervisors.SUPERVISORS.entries[name]
